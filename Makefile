@@ -63,8 +63,9 @@ $(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/requirements-devkits
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
 	touch $@
 
+# A test thread more than cores: most tests start whole runs, which wait for each other much of the time.
 test-rust:
-	cargo test $(CARGO_FLAGS) --no-fail-fast
+	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} cargo test $(CARGO_FLAGS) --no-fail-fast
 
 # One pytest each: test modules of different packages may share names.
 test-python:

@@ -29,7 +29,9 @@ pub enum BenchPart {
     Record,
     /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
     Endurance,
-    /// All of these but driving and endurance, one after the other
+    /// Soak: growth of memory, handles and logs of one long run with viewers and handovers
+    Soak,
+    /// All of these but driving, endurance and soak, one after the other
     All,
 }
 
@@ -41,7 +43,7 @@ impl BenchPart {
 
     /// The parts of `all`: those that measure a speed.
     pub fn speeds() -> impl Iterator<Item = Self> {
-        Self::measured().filter(|part| !matches!(part, Self::Driving | Self::Endurance))
+        Self::measured().filter(|part| !matches!(part, Self::Driving | Self::Endurance | Self::Soak))
     }
 
     /// Its name on the command line.
@@ -70,7 +72,7 @@ pub struct BenchArgs {
     /// Measure only a small case: tests that the benchmark works, not how fast caraware is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
-    /// Time for which `endurance` disturbs runs, minutes; it completes the last run
+    /// Time for which `endurance` disturbs runs, and `soak` watches one, minutes; `endurance` completes the last run
     #[arg(long, value_name = "MINUTES", default_value_t = 10)]
     pub minutes: u64,
     /// Seed of the moments and kinds of `endurance`'s disturbances

@@ -3,7 +3,6 @@
 mod case;
 mod disk;
 mod run;
-mod target;
 
 use std::{
     fs,
@@ -78,11 +77,14 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         if options.quick || begun.elapsed() >= time {
             break;
         }
-        tracing::info!(
-            round,
-            faults = counts.iter().map(|counts| counts.faults.len()).sum::<usize>(),
-            "disturbed"
-        );
+        let [runs, faults] = [
+            counts.iter().map(|counts| counts.runs as usize).sum::<usize>(),
+            counts.iter().map(|counts| counts.faults.len()).sum(),
+        ];
+        caraware::display::notice(&format!(
+            "{:.0} min: {runs} runs completed, {faults} faults",
+            begun.elapsed().as_secs_f64() / 60.0
+        ));
     }
     add_counts(&mut report, &cases, &counts)?;
     report.faults = counts.into_iter().flat_map(|counts| counts.faults).collect();
@@ -208,6 +210,12 @@ fn add_counts(report: &mut BenchReport, cases: &[EnduranceCase], counts: &[Endur
             ]);
         }
     }
-    report.tables.extend([table, resources]);
+    let mut refusals = ReportTable::new("handovers refused or given up", &["case", "reason", "times"]);
+    for (case, counts) in cases.iter().zip(counts) {
+        for (reason, times) in &counts.refusals {
+            refusals.row([case.name.into(), reason.clone(), times.to_string()]);
+        }
+    }
+    report.tables.extend([table, resources, refusals]);
     Ok(())
 }

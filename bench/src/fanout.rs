@@ -19,7 +19,7 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-use super::{BenchOptions, BenchReport, MedianSpread, ReportTable};
+use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, free_port};
 
 /// Wall time of a paced run, seconds.
 const PACED_S: u64 = 20;
@@ -522,13 +522,6 @@ fn pause() {
 fn unix_ns() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
-}
-
-fn free_port() -> Result<u16, Exit> {
-    std::net::TcpListener::bind("127.0.0.1:0")
-        .and_then(|listener| listener.local_addr())
-        .map(|address| address.port())
-        .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
 }
 
 /// Lateness of each tick, sorted, milliseconds. The reference is a clock of ten ticks a second that no tick is ahead of.

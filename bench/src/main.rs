@@ -18,7 +18,9 @@ mod record;
 mod report;
 mod scale;
 mod sides;
+mod soak;
 mod stages;
+mod target;
 mod trainer;
 
 use std::{io::Write as _, path::PathBuf, process::ExitCode};
@@ -38,7 +40,7 @@ pub struct BenchOptions {
     pub python: Option<PathBuf>,
     /// True if only a small case is measured, whose figures are not kept.
     pub quick: bool,
-    /// Time for which runs are disturbed, minutes.
+    /// Time for which runs are disturbed or watched, minutes.
     pub minutes: u64,
     /// Seed of the disturbances.
     pub seed: u64,
@@ -120,6 +122,7 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
     match part {
         BenchPart::Driving => driving::measure(options),
         BenchPart::Endurance => endurance::measure(options),
+        BenchPart::Soak => soak::measure(options),
         BenchPart::Envs => envs::measure(options),
         BenchPart::Ipc => ipc::measure(options),
         BenchPart::Lidar => lidar::measure(options),
@@ -131,4 +134,15 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
         BenchPart::Record => record::measure(options),
         BenchPart::All => Err(Exit::config("`all` is not a part", "")),
     }
+}
+
+/// A port of this machine that no process uses.
+///
+/// # Errors
+/// There is none.
+fn free_port() -> Result<u16, Exit> {
+    std::net::TcpListener::bind("127.0.0.1:0")
+        .and_then(|listener| listener.local_addr())
+        .map(|address| address.port())
+        .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
 }

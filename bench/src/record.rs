@@ -12,7 +12,7 @@ use serde_json::Value;
 use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, sides::BenchDirectory};
 
 /// Vehicles, simulated seconds, rounds.
-const SIZE: (u32, f64, usize) = (1000, 60.0, 5);
+const SIZE: (u32, f64, usize) = (1000, 240.0, 12);
 /// The same with `--quick`.
 const QUICK: (u32, f64, usize) = (60, 6.0, 1);
 /// The manners that are compared with a run without a recording.

@@ -27,6 +27,7 @@ fn the_help_shows_the_command_and_every_part() {
         "peers",
         "record",
         "endurance",
+        "soak",
         "all",
     ] {
         assert!(text.contains(&format!("- {part}:")), "{part}: {text}");

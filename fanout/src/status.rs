@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use ipc_schema::{
+    activity::Activity,
     board::{Health, State, TrainingStatus},
     config::Field,
     process::Process,
@@ -96,8 +97,12 @@ fn scene_json(run: &RunFile) -> Option<String> {
 pub struct ProcessStatus {
     /// Its name.
     pub name: &'static str,
-    /// Its state.
+    /// Its state; `stalled` if it hangs.
     pub state: &'static str,
+    /// Seconds since it last finished a piece of work or looked for what it waits for.
+    pub silent_s: f64,
+    /// What it waits for: the name of a process, `–` for something else, or nothing.
+    pub waits_for: String,
     /// Ticks produced or consumed.
     pub ticks: u64,
     /// Ticks that it is behind SUMO.
@@ -117,12 +122,14 @@ pub struct ProcessStatus {
 }
 
 impl ProcessStatus {
-    /// The state that `process` wrote onto its board, when SUMO has made `sumo_ticks` ticks.
+    /// The state and the activity that `process` of `run` wrote onto its board, when SUMO has made `sumo_ticks` ticks.
     #[must_use]
-    pub fn of(process: Process, health: &Health, sumo_ticks: u64) -> Self {
+    pub fn of(run: &RunFile, process: Process, health: &Health, activity: &Activity, sumo_ticks: u64) -> Self {
         Self {
             name: process.name(),
-            state: State::from_u32(health.state).name(),
+            state: activity.state_name(State::from_u32(health.state), run.config.run.stall_s),
+            silent_s: activity.age_s(),
+            waits_for: activity.awaited().to_string(),
             ticks: health.ticks,
             lag: sumo_ticks.saturating_sub(health.ticks),
             episode: health.episode,

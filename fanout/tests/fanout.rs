@@ -143,11 +143,14 @@ fn a_fast_producer_is_decimated_and_counted() {
         fanout.0.try_wait().unwrap().is_some()
     });
     assert_eq!(fanout.exit_code(), Some(0));
+    // The last frame may still be on its way when the fan-out has ended.
     let mut ticks = Vec::new();
-    while let Some(sample) = world.try_recv().unwrap() {
+    while ticks.last() != Some(&5_000) {
+        let sample = world.recv_timeout(PATIENCE).unwrap();
+        let sample = sample.unwrap_or_else(|| panic!("the last frame is missing: {ticks:?}"));
         ticks.push(fanout::frame::decode(&sample.payload().to_bytes()).unwrap().0.tick);
     }
-    assert!(ticks.is_sorted() && ticks.last() == Some(&5_000), "{ticks:?}");
+    assert!(ticks.is_sorted(), "{ticks:?}");
     assert!(ticks.len() < 500, "{}", ticks.len());
     assert!(board.health().drops > 0);
 }

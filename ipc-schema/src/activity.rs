@@ -2,7 +2,7 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::{clock, process::Process};
+use crate::{board::State, clock, process::Process};
 
 /// What a process waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,6 +74,15 @@ impl Activity {
     pub fn age_s(&self) -> f64 {
         clock::monotonic_ns().saturating_sub(self.noted_ns) as f64 * 1e-9
     }
+
+    /// The name of the state of a process whose board says `state`, or `stalled` if it hangs: it has been silent for `stall_s` seconds.
+    #[must_use]
+    pub fn state_name(&self, state: State, stall_s: f64) -> &'static str {
+        match state {
+            State::Ready | State::Running if self.age_s() > stall_s => "stalled",
+            state => state.name(),
+        }
+    }
 }
 
 impl std::fmt::Display for Awaited {
@@ -99,5 +108,19 @@ mod tests {
         for awaited in waits.chain([Awaited::Nothing, Awaited::Other]) {
             assert_eq!(Activity::now(awaited).awaited(), awaited);
         }
+    }
+
+    #[test]
+    fn a_silent_process_is_stalled_unless_it_starts_or_is_done() {
+        let activity = Activity::now(Awaited::Nothing);
+        assert_eq!(activity.state_name(State::Running, 100.0), "running");
+        let silent = Activity {
+            noted_ns: 0,
+            ..activity
+        };
+        assert!(silent.age_s() > 0.0);
+        let names =
+            [State::Starting, State::Ready, State::Running, State::Done].map(|state| silent.state_name(state, 0.0));
+        assert_eq!(names, ["starting", "stalled", "stalled", "done"]);
     }
 }

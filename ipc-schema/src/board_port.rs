@@ -14,6 +14,7 @@ use crate::{
         self, ACTIVITY_KEY, BoardSeries, BoardService, HEALTH_KEY, PROGRESS_KEY, ROSTER_KEY, RunNode, ServiceError,
         ServiceHolder, Shm, TRAINING_KEY,
     },
+    storage::retry_on_full_disk,
 };
 
 /// The writing end of the board of one incarnation of a process.
@@ -28,9 +29,7 @@ pub struct BoardWriter {
 
 impl BoardWriter {
     pub(crate) fn create(service: &BoardService) -> Result<Self, PortError> {
-        let writer = service
-            .writer_builder()
-            .create()
+        let writer = retry_on_full_disk(|| service.writer_builder().create())
             .map_err(|e| refused("board", "creation of the writer")(&e))?;
         Ok(Self {
             progress: writer
@@ -83,10 +82,8 @@ struct OpenedBoard {
 
 impl OpenedBoard {
     fn open(node: &RunNode, series: &BoardSeries, incarnation: u32) -> Result<Self, BoardError> {
-        let reader = series
-            .open(node, incarnation)?
-            .reader_builder()
-            .create()
+        let service = series.open(node, incarnation)?;
+        let reader = retry_on_full_disk(|| service.reader_builder().create())
             .map_err(|e| refused("board", "creation of the reader")(&e))?;
         Ok(Self {
             incarnation,
@@ -128,9 +125,8 @@ impl BoardReader {
     /// # Errors
     /// The services are not there, or all readers are taken.
     pub fn open(node: &RunNode, run: &RunFile, env_index: u32, process: Process) -> Result<Self, BoardError> {
-        let roster_port = services::open_roster(node, run, env_index)?
-            .reader_builder()
-            .create()
+        let service = services::open_roster(node, run, env_index)?;
+        let roster_port = retry_on_full_disk(|| service.reader_builder().create())
             .map_err(|e| refused("roster", "creation of the reader")(&e))?;
         let roster: reader::EntryHandle<Shm, u32, Roster> = roster_port
             .entry(&ROSTER_KEY)
@@ -229,10 +225,7 @@ impl RosterWriter {
     /// # Errors
     /// The roster has a writer already.
     pub fn create(services: &ServiceHolder) -> Result<Self, PortError> {
-        let port = services
-            .roster()
-            .writer_builder()
-            .create()
+        let port = retry_on_full_disk(|| services.roster().writer_builder().create())
             .map_err(|e| refused("roster", "creation of the writer")(&e))?;
         let entry = port
             .entry(&ROSTER_KEY)

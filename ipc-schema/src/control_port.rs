@@ -10,6 +10,7 @@ use crate::{
     control::{Command, ControlReply, ControlRequest, Refusal, RefusalKind, Reply},
     ports::{PortError, refused},
     services::{ControlService, Shm},
+    storage::retry_on_full_disk,
 };
 
 const NAME: &str = "control";
@@ -26,11 +27,13 @@ impl ControlClient {
     /// # Errors
     /// iceoryx2 refuses.
     pub fn create(service: &ControlService) -> Result<Self, PortError> {
-        let client = service
-            .client_builder()
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|e| refused(NAME, "creation of the client")(&e))?;
+        let create = || {
+            service
+                .client_builder()
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+        };
+        let client = retry_on_full_disk(create).map_err(|e| refused(NAME, "creation of the client")(&e))?;
         Ok(Self(client))
     }
 
@@ -74,11 +77,13 @@ impl ControlServer {
     /// # Errors
     /// iceoryx2 refuses.
     pub fn create(service: &ControlService) -> Result<Self, PortError> {
-        let server = service
-            .server_builder()
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|e| refused(NAME, "creation of the server")(&e))?;
+        let create = || {
+            service
+                .server_builder()
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+        };
+        let server = retry_on_full_disk(create).map_err(|e| refused(NAME, "creation of the server")(&e))?;
         Ok(Self(server))
     }
 

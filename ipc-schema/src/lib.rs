@@ -56,7 +56,7 @@ pub mod pointcloud;
 pub mod ports;
 pub mod prediction;
 pub mod process;
-mod process_main;
+pub mod process_main;
 pub mod props;
 pub mod radar;
 mod required_consumers;

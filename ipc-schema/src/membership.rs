@@ -173,10 +173,9 @@ impl RunMembership {
         }
         storage::stop_waiting_at(&stop);
         let node = services::node(&run.shared_memory)?;
-        let wake = services::open_wake(&node, &run, env_index, process)?
-            .listener_builder()
-            .create()
-            .map_err(|e| PortError::Refused {
+        let wakes = services::open_wake(&node, &run, env_index, process)?;
+        let wake =
+            storage::retry_on_full_disk(|| wakes.listener_builder().create()).map_err(|e| PortError::Refused {
                 channel: "wake",
                 action: "creation of the listener",
                 reason: format!("{e:?}"),

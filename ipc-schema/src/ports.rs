@@ -20,6 +20,7 @@ use crate::{
     reserve::{self, ReserveError},
     run::RunFile,
     services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
+    storage::retry_on_full_disk,
 };
 
 pub use crate::{
@@ -98,20 +99,22 @@ pub struct Publisher {
 impl Publisher {
     pub(crate) fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
         let drops = Arc::new(AtomicU64::new(0));
-        let counter = Arc::clone(&drops);
         let limit = channel.max_payload(run);
-        let port = service
-            .publisher_builder()
-            .initial_max_slice_len(limit.max(1))
-            .allocation_strategy(AllocationStrategy::Static)
-            .max_loaned_samples(2)
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .set_backpressure_handler(move |_| {
-                counter.fetch_add(1, Ordering::Relaxed);
-                BackpressureAction::DiscardData
-            })
-            .create()
-            .map_err(|e| refused(channel.name(), "creation of the publisher")(&e))?;
+        let create = || {
+            let counter = Arc::clone(&drops);
+            service
+                .publisher_builder()
+                .initial_max_slice_len(limit.max(1))
+                .allocation_strategy(AllocationStrategy::Static)
+                .max_loaned_samples(2)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .set_backpressure_handler(move |_| {
+                    counter.fetch_add(1, Ordering::Relaxed);
+                    BackpressureAction::DiscardData
+                })
+                .create()
+        };
+        let port = retry_on_full_disk(create).map_err(|e| refused(channel.name(), "creation of the publisher")(&e))?;
         {
             let loan = || port.loan_slice_uninit(limit.max(1));
             let first = loan().map_err(|e| refused(channel.name(), "loan")(&e))?;
@@ -240,9 +243,7 @@ impl Subscriber {
     /// # Errors
     /// iceoryx2 refuses.
     pub fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
-        let port = service
-            .subscriber_builder()
-            .create()
+        let port = retry_on_full_disk(|| service.subscriber_builder().create())
             .map_err(|e| refused(channel.name(), "creation of the subscriber")(&e))?;
         Ok(Self {
             port,
@@ -340,9 +341,7 @@ pub struct Waker(Notifier<Shm>);
 impl Waker {
     pub(crate) fn create(service: &WakeService) -> Result<Self, PortError> {
         Ok(Self(
-            service
-                .notifier_builder()
-                .create()
+            retry_on_full_disk(|| service.notifier_builder().create())
                 .map_err(|e| refused("wake", "creation of the notifier")(&e))?,
         ))
     }

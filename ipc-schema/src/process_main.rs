@@ -9,6 +9,17 @@ use crate::{
     process::Process,
 };
 
+/// Sends the warnings of this process to standard error, a line each. For programs that have no log of their own.
+pub fn show_warnings() {
+    let log = tracing_subscriber::fmt::layer()
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .without_time()
+        .with_target(false)
+        .with_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into()));
+    tracing_subscriber::registry().with(log).init();
+}
+
 /// The `main` of a process binary: reads the run file named by the first argument, logs to standard error, runs `body`,
 /// and turns its failure into a failure file and an exit code.
 pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -> ExitCode {

@@ -29,10 +29,11 @@ pub(crate) struct SentStream {
     addressee: AtomicU32,
     /// The first tick of the stream that was sent; [`NO_TICK`] before.
     first: AtomicU64,
-    /// One more than the newest tick that was sent in any stream of this process.
+    /// One more than the newest tick of the stream that was sent; 0 before the first.
     ticks: AtomicU64,
-    /// Ticks that were sent in earlier streams of this process, and have to be consumed before this one begins.
-    earlier_ticks: AtomicU64,
+    /// The newest earlier stream of this process in which something was sent: the incarnation that it was addressed to, and one more than its newest tick;
+    /// 0 if there is none. All of it has to be consumed before this stream begins. An older one may have had later ticks.
+    earlier: (AtomicU32, AtomicU64),
     /// Incarnation of `recorder` that all of this is about.
     recorder: AtomicU32,
 }
@@ -47,16 +48,22 @@ impl SentStream {
             addressee: AtomicU32::new(0),
             first: AtomicU64::new(NO_TICK),
             ticks: AtomicU64::new(0),
-            earlier_ticks: AtomicU64::new(0),
+            earlier: (AtomicU32::new(0), AtomicU64::new(0)),
             recorder: AtomicU32::new(0),
         }
     }
 
     fn turn_to(&self, addressee: u32) {
-        if self.addressee.swap(addressee, Relaxed) != addressee {
-            self.earlier_ticks.store(self.ticks.load(Relaxed), Relaxed);
-            self.first.store(NO_TICK, Relaxed);
+        let before = self.addressee.swap(addressee, Relaxed);
+        if before == addressee {
+            return;
         }
+        let ticks = self.ticks.swap(0, Relaxed);
+        if ticks > 0 {
+            self.earlier.0.store(before, Relaxed);
+            self.earlier.1.store(ticks, Relaxed);
+        }
+        self.first.store(NO_TICK, Relaxed);
     }
 
     fn add(&self, tick: u64) {
@@ -71,14 +78,16 @@ impl SentStream {
         if self.recorder.swap(progress.incarnation, Relaxed) != progress.incarnation {
             // What was sent to the one before it is not in the queue of this one.
             self.first.store(NO_TICK, Relaxed);
-            self.earlier_ticks.store(0, Relaxed);
+            self.ticks.store(0, Relaxed);
+            self.earlier.1.store(0, Relaxed);
         }
         let recorded_ticks = progress.consumed_of(Process::Recorder, channel);
-        let own = MessageStream {
+        let to = |addressee: &AtomicU32| MessageStream {
             sender: self.sender,
-            addressee: self.addressee.load(Relaxed),
+            addressee: addressee.load(Relaxed),
         };
-        if progress.recorded_stream(channel) == own {
+        let recorded = progress.recorded_stream(channel);
+        if recorded == to(&self.addressee) {
             return flow::has_credit_at(tick, progress, recorded_ticks, window);
         }
         // None of this stream has been consumed yet.
@@ -86,7 +95,9 @@ impl SentStream {
             NO_TICK => tick,
             first => first,
         };
-        recorded_ticks >= self.earlier_ticks.load(Relaxed) && flow::has_credit_at(tick, progress, first, window)
+        let earlier_ticks = self.earlier.1.load(Relaxed);
+        let is_earlier_consumed = recorded == to(&self.earlier.0) && recorded_ticks >= earlier_ticks;
+        (earlier_ticks == 0 || is_earlier_consumed) && flow::has_credit_at(tick, progress, first, window)
     }
 }
 
@@ -209,5 +220,27 @@ mod tests {
         );
         assert_eq!(send_all(&stream, 64, &progress(before, 101, 0)), 72);
         assert_eq!(send_all(&stream, 72, &progress(now, 72, 0)), 80);
+    }
+
+    /// Each successor is sent the ticks since the checkpoint again, and may die after a few of them.
+    #[test]
+    fn successors_that_die_early_leave_no_claim_behind() {
+        let to = |addressee| MessageStream { sender: 0, addressee };
+        let stream = SentStream::of(0);
+        assert_eq!(send_all(&stream, 0, &progress(to(0), 92, 0)), 100);
+        stream.turn_to(1);
+        assert_eq!(send_all(&stream, 64, &progress(to(0), 100, 0)), 72);
+        stream.turn_to(2);
+        assert_eq!(
+            send_all(&stream, 64, &progress(to(0), 100, 0)),
+            64,
+            "the queue has 64 to 71"
+        );
+        assert_eq!(send_all(&stream, 64, &progress(to(1), 71, 0)), 64, "the queue has 71");
+        // Nothing is sent to the next one.
+        stream.turn_to(3);
+        stream.turn_to(4);
+        assert_eq!(send_all(&stream, 64, &progress(to(1), 72, 0)), 72);
+        assert_eq!(send_all(&stream, 72, &progress(to(4), 65, 0)), 73);
     }
 }

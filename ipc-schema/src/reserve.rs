@@ -162,7 +162,7 @@ pub fn refill(run: &RunFile) {
 }
 
 /// Files of the run in shared memory.
-fn files(memory: &SharedMemory) -> impl Iterator<Item = PathBuf> {
+pub(crate) fn files(memory: &SharedMemory) -> impl Iterator<Item = PathBuf> {
     let prefix = memory.prefix.clone();
     let entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
     entries

@@ -186,7 +186,7 @@ pub struct SharedMemory {
 const STEPS_AHEAD: u64 = 3;
 /// Longest time between two states of a road user that the mirror's window is made of, seconds, where a tick is not longer.
 const FRAME_S: f64 = 0.1;
-/// Longest wait for space on a full disk before the run file is given up.
+/// Longest wait for space on a full disk before a start is given up.
 const SPACE_WITHIN: Duration = Duration::from_secs(10);
 
 /// The run file, `run.json` in the run directory.
@@ -344,17 +344,29 @@ impl RunFile {
         })
     }
 
-    /// Writes the run file to `run_dir/run.json` and returns its path.
+    /// Writes the run file of a run that starts to `run_dir/run.json`, and returns its path.
     ///
     /// # Errors
-    /// The run directory is not writable.
+    /// The run directory is not writable, or its disk stays full.
     pub fn write(&self) -> Result<PathBuf, RunFileError> {
+        self.write_within(SPACE_WITHIN)
+    }
+
+    /// Writes the run file of a live run again, and waits while the disk is full.
+    ///
+    /// # Errors
+    /// The run directory is not writable, or the process is asked to stop while the disk is full.
+    pub fn rewrite(&self) -> Result<PathBuf, RunFileError> {
+        self.write_within(Duration::MAX)
+    }
+
+    fn write_within(&self, limit: Duration) -> Result<PathBuf, RunFileError> {
         let path = self.run_dir.join("run.json");
         let text = self.to_json().map_err(|source| RunFileError::Format {
             path: path.clone(),
             source,
         })?;
-        let written = storage::wait_for_space(&path, SPACE_WITHIN, || storage::write_whole(&path, &text));
+        let written = storage::wait_for_space(&path, limit, || storage::write_whole(&path, &text));
         written.map_err(|source| RunFileError::Io {
             path: path.clone(),
             source,
@@ -523,11 +535,9 @@ impl RunFile {
             let indices = episode.saturating_sub(resets)..episodes.unwrap_or(u64::MAX);
             return Box::new(indices.map(move |index| schedule::play(seed, index, ticks)));
         }
-        Box::new(
-            self.episodes()
-                .into_iter()
-                .filter(move |due| due.index + resets >= episode),
-        )
+        let run = self.clone();
+        let episodes = (0..).map_while(move |index| run.episode(index));
+        Box::new(episodes.filter(move |due| due.index + resets >= episode))
     }
 
     /// The plan of this run's curriculum, if it has one.
@@ -544,16 +554,48 @@ impl RunFile {
         }
     }
 
-    /// The episodes of this run, as the configuration plans them; none in play. With a curriculum the run may end earlier.
+    /// The `index`-th episode of this run, as the configuration plans it; `None` past the last one, and in play. With a curriculum the run
+    /// may end earlier.
     #[must_use]
-    pub fn episodes(&self) -> Vec<schedule::Episode> {
+    pub fn episode(&self, index: u64) -> Option<schedule::Episode> {
         let (lengths, seed) = (&self.config.episode, self.seed());
-        match (&self.source, self.mode) {
-            (_, Mode::Play) => Vec::new(),
-            (Source::Scenario { .. }, Mode::Simulate) => schedule::scenario(seed),
-            (Source::Scenario { .. }, Mode::Train) if lengths.whole_scenario => schedule::scenario(seed),
-            (_, Mode::Train) => schedule::training(lengths, seed),
-            (Source::Population { .. }, Mode::Simulate) => schedule::simulation(lengths, seed),
+        match self.planned_manner() {
+            PlannedManner::Play => None,
+            PlannedManner::Scenario => schedule::scenario(seed, index),
+            PlannedManner::Training => schedule::training(lengths, seed, index),
+            PlannedManner::Simulation => schedule::simulation(lengths, seed, index),
         }
     }
+
+    /// How many episodes of which length the configuration plans; none in play.
+    #[must_use]
+    pub fn episode_counts(&self) -> Vec<schedule::EpisodeCount> {
+        let lengths = &self.config.episode;
+        let counted = |ticks, episodes| vec![schedule::EpisodeCount { ticks, episodes }];
+        match self.planned_manner() {
+            PlannedManner::Play => Vec::new(),
+            PlannedManner::Scenario => counted(None, 1),
+            PlannedManner::Training => schedule::training_counts(lengths).to_vec(),
+            PlannedManner::Simulation => counted(Some(lengths.ticks), lengths.training_episodes),
+        }
+    }
+
+    fn planned_manner(&self) -> PlannedManner {
+        match (&self.source, self.mode) {
+            (_, Mode::Play) => PlannedManner::Play,
+            (Source::Scenario { .. }, Mode::Simulate) => PlannedManner::Scenario,
+            (Source::Scenario { .. }, Mode::Train) if self.config.episode.whole_scenario => PlannedManner::Scenario,
+            (_, Mode::Train) => PlannedManner::Training,
+            (Source::Population { .. }, Mode::Simulate) => PlannedManner::Simulation,
+        }
+    }
+}
+
+/// How the episodes of a run follow each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum PlannedManner {
+    Play,
+    Scenario,
+    Training,
+    Simulation,
 }

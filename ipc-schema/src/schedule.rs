@@ -15,55 +15,92 @@ pub struct Episode {
     pub ticks: Option<u64>,
 }
 
-/// The episodes of a training run: training episodes, evaluations at the interval, and the final evaluations.
-#[must_use]
-pub fn training(lengths: &Lengths, seed: u64) -> Vec<Episode> {
-    let mut episodes = Vec::new();
-    let (mut trained, mut evaluated) = (0, 0);
-    let mut push = |evaluation: bool, count: &mut u64, ticks: u64| {
-        episodes.push(Episode {
-            index: episodes.len() as u64,
-            evaluation,
-            seed: episode_seed(seed, evaluation, *count),
-            ticks: Some(ticks),
-        });
-        *count += 1;
-    };
-    while trained < lengths.training_episodes {
-        push(false, &mut trained, lengths.ticks);
-        let due = lengths.evaluation_interval > 0 && trained % lengths.evaluation_interval == 0;
-        if due && trained < lengths.training_episodes {
-            push(true, &mut evaluated, lengths.evaluation_ticks);
-        }
-    }
-    for _ in 0..lengths.final_evaluations {
-        push(true, &mut evaluated, lengths.evaluation_ticks);
-    }
-    episodes
+/// How many episodes of one kind and length a run plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EpisodeCount {
+    /// Length of each in ticks; `None` means until the scenario ends.
+    pub ticks: Option<u64>,
+    /// How many.
+    pub episodes: u64,
 }
 
-/// The episodes of a run without learning: all training episodes in order.
+/// The `index`-th episode of a training run: training episodes, evaluations at the interval, and the final evaluations. `None` past the
+/// last one.
 #[must_use]
-pub fn simulation(lengths: &Lengths, seed: u64) -> Vec<Episode> {
-    (0..lengths.training_episodes)
-        .map(|index| Episode {
-            index,
-            evaluation: false,
-            seed: episode_seed(seed, false, index),
+pub fn training(lengths: &Lengths, seed: u64, index: u64) -> Option<Episode> {
+    let between = evaluations_between(lengths);
+    let (evaluation, number) = match lengths.training_episodes + between {
+        before_the_end if index >= before_the_end => {
+            let number = index - before_the_end;
+            if number >= lengths.final_evaluations {
+                return None;
+            }
+            (true, between + number)
+        }
+        _ => {
+            // As many training episodes as the interval, and the evaluation that follows them.
+            let group = index / lengths.evaluation_interval.saturating_add(1);
+            let place = index - group * lengths.evaluation_interval.saturating_add(1);
+            match between {
+                between if group >= between => (false, index - between),
+                _ if place == lengths.evaluation_interval => (true, group),
+                _ => (false, index - group),
+            }
+        }
+    };
+    let ticks = match evaluation {
+        true => lengths.evaluation_ticks,
+        false => lengths.ticks,
+    };
+    Some(Episode {
+        index,
+        evaluation,
+        seed: episode_seed(seed, evaluation, number),
+        ticks: Some(ticks),
+    })
+}
+
+/// The lengths of a training run's episodes, training episodes first.
+#[must_use]
+pub fn training_counts(lengths: &Lengths) -> [EpisodeCount; 2] {
+    [
+        EpisodeCount {
             ticks: Some(lengths.ticks),
-        })
-        .collect()
+            episodes: lengths.training_episodes,
+        },
+        EpisodeCount {
+            ticks: Some(lengths.evaluation_ticks),
+            episodes: evaluations_between(lengths) + lengths.final_evaluations,
+        },
+    ]
+}
+
+/// Evaluations before the last training episode.
+fn evaluations_between(lengths: &Lengths) -> u64 {
+    let last = lengths.training_episodes.saturating_sub(1);
+    last.checked_div(lengths.evaluation_interval).unwrap_or(0)
+}
+
+/// The `index`-th episode of a run without learning: all training episodes in order.
+#[must_use]
+pub fn simulation(lengths: &Lengths, seed: u64, index: u64) -> Option<Episode> {
+    (index < lengths.training_episodes).then(|| Episode {
+        index,
+        evaluation: false,
+        seed: episode_seed(seed, false, index),
+        ticks: Some(lengths.ticks),
+    })
 }
 
 /// The single episode of a user's scenario. It has the run's seed and lasts until the scenario ends.
 #[must_use]
-pub fn scenario(seed: u64) -> Vec<Episode> {
-    vec![Episode {
-        index: 0,
+pub fn scenario(seed: u64, index: u64) -> Option<Episode> {
+    (index == 0).then_some(Episode {
+        index,
         evaluation: false,
         seed,
         ticks: None,
-    }]
+    })
 }
 
 /// Seed of the `environment`-th environment: the run's own for the first, then the first eight bytes of a BLAKE3 hash.
@@ -304,10 +341,47 @@ mod tests {
         }
     }
 
+    fn all(lengths: &Lengths, seed: u64) -> Vec<Episode> {
+        (0..).map_while(|index| training(lengths, seed, index)).collect()
+    }
+
     #[test]
     fn evaluations_come_at_the_interval_and_at_the_end() {
-        let kinds: Vec<bool> = training(&lengths(4, 2, 2), 1).iter().map(|e| e.evaluation).collect();
+        let kinds: Vec<bool> = all(&lengths(4, 2, 2), 1).iter().map(|e| e.evaluation).collect();
         assert_eq!(kinds, [false, false, true, false, false, true, true]);
+    }
+
+    proptest! {
+        /// The plan by index is the one that counts the episodes one after the other.
+        #[test]
+        fn an_episode_of_any_index_is_that_of_the_loop(
+            training_episodes in 0_u64..40,
+            interval in 0_u64..12,
+            final_evaluations in 0_u64..4,
+        ) {
+            let lengths = lengths(training_episodes, interval, final_evaluations);
+            let mut expected = Vec::new();
+            let mut counts = [0; 2];
+            let mut push = |evaluation: bool| {
+                let count = &mut counts[usize::from(evaluation)];
+                expected.push(Episode {
+                    index: expected.len() as u64,
+                    evaluation,
+                    seed: episode_seed(7, evaluation, *count),
+                    ticks: Some(if evaluation { lengths.evaluation_ticks } else { lengths.ticks }),
+                });
+                *count += 1;
+            };
+            for trained in 1..=training_episodes {
+                push(false);
+                if trained < training_episodes && trained.checked_rem(interval) == Some(0) {
+                    push(true);
+                }
+            }
+            (0..final_evaluations).for_each(|_| push(true));
+            prop_assert_eq!(all(&lengths, 7), expected);
+            prop_assert_eq!(training_counts(&lengths).map(|count| count.episodes), counts);
+        }
     }
 
     #[test]
@@ -447,14 +521,14 @@ mod tests {
     proptest! {
         #[test]
         fn no_two_environments_share_an_episode(seed: u64, n in 1_u64..8, environments in 2_u32..9) {
-            let episodes = (0..environments).flat_map(|env| training(&lengths(n, 2, 2), environment_seed(seed, env)));
+            let episodes = (0..environments).flat_map(|env| all(&lengths(n, 2, 2), environment_seed(seed, env)));
             let seeds: Vec<u64> = episodes.map(|episode| episode.seed).collect();
             prop_assert_eq!(seeds.iter().collect::<BTreeSet<_>>().len(), seeds.len());
         }
 
         #[test]
         fn no_seed_is_used_twice(seed: u64, n in 0_u64..50, interval in 0_u64..5, last in 0_u64..5) {
-            let episodes = training(&lengths(n, interval, last), seed);
+            let episodes = all(&lengths(n, interval, last), seed);
             let seeds: BTreeSet<u64> = episodes.iter().map(|e| e.seed).collect();
             prop_assert_eq!(seeds.len(), episodes.len());
             prop_assert_eq!(episodes.iter().filter(|e| !e.evaluation).count() as u64, n);

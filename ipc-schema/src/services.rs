@@ -1,7 +1,14 @@
 //! The services of a run: names, sizes and quality of service. The supervisor creates them all and keeps them open;
 //! every other process only opens them (killing a process while it creates a service can leave its name unusable).
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{
+    collections::VecDeque,
+    fs::{File, Metadata},
+    io::ErrorKind,
+    os::unix::fs::MetadataExt as _,
+    path::Path,
+    sync::Arc,
+};
 
 use iceoryx2::{
     config::Config as IpcConfig,
@@ -25,6 +32,7 @@ use crate::{
     process::{Process, ProcessScope},
     reserve,
     run::{RunFile, SharedMemory},
+    storage::{self, retry_on_full_disk},
 };
 
 pub use crate::channel::Channel;
@@ -61,8 +69,11 @@ const KEPT_BOARDS: usize = 2;
 const MAX_READERS: usize = 32;
 /// Readers of the roster: every reader of a board reads it.
 const MAX_ROSTER_READERS: usize = Process::COUNT * MAX_READERS;
+/// Attempts to remove a run's directory.
+const REMOVALS: usize = 5;
 /// Commands that wait for an answer at a time.
 const MAX_PENDING_COMMANDS: usize = 16;
+
 /// A service or node could not be created or opened.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {
@@ -106,18 +117,63 @@ fn invalid(name: &str) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
 /// A node in the run's own corner of shared memory.
 ///
 /// # Errors
-/// The root directory or prefix is unusable.
+/// The root directory or prefix is unusable, or the run has ended.
 pub fn node(memory: &SharedMemory) -> Result<RunNode, ServiceError> {
     // A supervisor that ends removes the run's files, also those that a spectator has open; iceoryx2 would warn of each.
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
     reserve::guard(memory);
-    NodeBuilder::new()
-        .config(&ipc_config(memory)?)
-        .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create::<Shm>()
-        .map(Arc::new)
-        .map_err(|e| refused("creation", "node")(&e))
-        .inspect(|_| reserve::close_to_others(memory))
+    storage::ipc_files_are_in(&memory.root);
+    let config = ipc_config(memory)?;
+    let create = || {
+        NodeBuilder::new()
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<Shm>()
+    };
+    let root = File::open(&memory.root).map_err(|e| refused("opening", "the run's directory")(&e))?;
+    let node = retry_on_full_disk(create).map_err(|e| refused("creation", "node")(&e))?;
+    // A run that has ended meanwhile has removed its files, and this node has made some of them again.
+    if has_been_removed(&root, &memory.root) {
+        drop(node);
+        remove_shared(memory);
+        let made = memory.root.join(config.global.node.directory.to_string());
+        if let Err(error) = std::fs::remove_dir_all(made).and_then(|()| std::fs::remove_dir(&memory.root)) {
+            tracing::debug!(%error, path = %memory.root.display(), "cannot remove what a node has made");
+        }
+        return Err(refused("creation", "node")(&"the run has ended"));
+    }
+    reserve::close_to_others(memory);
+    Ok(Arc::new(node))
+}
+
+/// True if the directory is not at `path` any more; another one may be.
+fn has_been_removed(directory: &File, path: &Path) -> bool {
+    let is_same = |one: &Metadata, other: &Metadata| (one.dev(), one.ino()) == (other.dev(), other.ino());
+    match (directory.metadata(), std::fs::metadata(path)) {
+        (Ok(opened), Ok(found)) => !is_same(&opened, &found),
+        _ => true,
+    }
+}
+
+fn remove_shared(memory: &SharedMemory) {
+    for path in reserve::files(memory) {
+        if let Err(error) = std::fs::remove_file(&path)
+            && error.kind() != ErrorKind::NotFound
+        {
+            tracing::warn!(%error, path = %path.display(), "cannot remove shared memory");
+        }
+    }
+}
+
+/// Removes a run's shared memory and its directory, which must be known to be a run's. Failures are only logged.
+pub fn remove_files(memory: &SharedMemory) {
+    remove_shared(memory);
+    // A client that attaches at this moment may add a file.
+    let removed = (0..REMOVALS).find_map(|_| std::fs::remove_dir_all(&memory.root).ok());
+    if removed.is_none() && memory.root.exists() {
+        tracing::warn!(path = %memory.root.display(), "cannot remove the run's directory");
+    }
+    remove_shared(memory);
 }
 
 /// Takes what dead processes left in the services that others hold open: their places there are free again.
@@ -147,26 +203,29 @@ fn service_name(run: &RunFile, env_index: u32, service: &str) -> Result<ServiceN
     ServiceName::new(&name).map_err(|e| invalid(&name)(&e))
 }
 
+/// Name and alignment of a data service.
+fn data_name(run: &RunFile, env_index: u32, channel: Channel) -> Result<(ServiceName, Alignment), ServiceError> {
+    let alignment = Alignment::new(ALIGNMENT).ok_or_else(|| invalid("alignment")(&ALIGNMENT))?;
+    Ok((service_name(run, env_index, channel.name())?, alignment))
+}
+
 fn data_builder(
     node: &Node<Shm>,
+    (name, alignment): &(ServiceName, Alignment),
     run: &RunFile,
-    env_index: u32,
     channel: Channel,
-) -> Result<DataBuilder<[u8], MessageHeader, Shm>, ServiceError> {
-    let name = service_name(run, env_index, channel.name())?;
-    let alignment = Alignment::new(ALIGNMENT).ok_or_else(|| invalid("alignment")(&ALIGNMENT))?;
-    Ok(node
-        .service_builder(&name)
+) -> DataBuilder<[u8], MessageHeader, Shm> {
+    node.service_builder(name)
         .publish_subscribe::<[u8]>()
         .user_header::<MessageHeader>()
-        .payload_alignment(alignment)
+        .payload_alignment(*alignment)
         .enable_safe_overflow(channel.spec().when_full == FullQueue::DropOldest)
         .history_size(0)
         .max_publishers(2)
         .max_subscribers(channel.max_subscribers())
         .max_nodes(MAX_NODES)
         .subscriber_max_buffer_size(channel.queue_length(run))
-        .subscriber_max_borrowed_samples((channel.spec().in_hand)(run)))
+        .subscriber_max_borrowed_samples((channel.spec().in_hand)(run))
 }
 
 /// Opens a data service.
@@ -179,8 +238,8 @@ pub fn open_data(
     env_index: u32,
     channel: Channel,
 ) -> Result<DataService, ServiceError> {
-    data_builder(node, run, env_index, channel)?
-        .open()
+    let name = data_name(run, env_index, channel)?;
+    retry_on_full_disk(|| data_builder(node, &name, run, channel).open())
         .map_err(|e| refused("opening", channel.name())(&e))
 }
 
@@ -189,18 +248,12 @@ pub fn open_data(
 /// # Errors
 /// It does not exist.
 pub fn open_control(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<ControlService, ServiceError> {
-    control_builder(node, run, env_index)?
-        .open()
-        .map_err(|e| refused("opening", "control")(&e))
+    let name = service_name(run, env_index, "control")?;
+    retry_on_full_disk(|| control_builder(node, &name).open()).map_err(|e| refused("opening", "control")(&e))
 }
 
-fn control_builder(
-    node: &Node<Shm>,
-    run: &RunFile,
-    env_index: u32,
-) -> Result<ControlBuilder<ControlRequest, (), ControlReply, (), Shm>, ServiceError> {
-    Ok(node
-        .service_builder(&service_name(run, env_index, "control")?)
+fn control_builder(node: &Node<Shm>, name: &ServiceName) -> ControlBuilder<ControlRequest, (), ControlReply, (), Shm> {
+    node.service_builder(name)
         .request_response::<ControlRequest, ControlReply>()
         .enable_safe_overflow_for_requests(false)
         .enable_safe_overflow_for_responses(false)
@@ -211,7 +264,7 @@ fn control_builder(
         .max_borrowed_responses_per_pending_response(1)
         .max_servers(1)
         .max_clients(2)
-        .max_nodes(MAX_NODES))
+        .max_nodes(MAX_NODES)
 }
 
 /// The boards of a process of one environment: each incarnation has its own, because iceoryx2 leaves the entries of a killed writer
@@ -236,23 +289,25 @@ impl BoardSeries {
     /// # Errors
     /// It does not exist: the supervisor has not created it yet, or has removed it.
     pub fn open(&self, node: &Node<Shm>, incarnation: u32) -> Result<BoardService, ServiceError> {
-        node.service_builder(&self.name(incarnation)?)
-            .blackboard_opener::<u32>()
-            .open()
+        let name = self.name(incarnation)?;
+        retry_on_full_disk(|| node.service_builder(&name).blackboard_opener::<u32>().open())
             .map_err(|e| refused("opening", format!("{}/{incarnation}", self.0))(&e))
     }
 
     fn create(&self, node: &Node<Shm>, incarnation: u32) -> Result<BoardService, ServiceError> {
-        node.service_builder(&self.name(incarnation)?)
-            .blackboard_creator::<u32>()
-            .max_readers(MAX_READERS)
-            .max_nodes(MAX_NODES)
-            .add(PROGRESS_KEY, Progress::default())
-            .add(HEALTH_KEY, Health::default())
-            .add(TRAINING_KEY, TrainingStatus::default())
-            .add(ACTIVITY_KEY, Activity::default())
-            .create()
-            .map_err(|e| refused("creation", format!("{}/{incarnation}", self.0))(&e))
+        let name = self.name(incarnation)?;
+        let create = || {
+            node.service_builder(&name)
+                .blackboard_creator::<u32>()
+                .max_readers(MAX_READERS)
+                .max_nodes(MAX_NODES)
+                .add(PROGRESS_KEY, Progress::default())
+                .add(HEALTH_KEY, Health::default())
+                .add(TRAINING_KEY, TrainingStatus::default())
+                .add(ACTIVITY_KEY, Activity::default())
+                .create()
+        };
+        retry_on_full_disk(create).map_err(|e| refused("creation", format!("{}/{incarnation}", self.0))(&e))
     }
 }
 
@@ -261,9 +316,8 @@ impl BoardSeries {
 /// # Errors
 /// It does not exist.
 pub fn open_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<BoardService, ServiceError> {
-    node.service_builder(&service_name(run, env_index, "roster")?)
-        .blackboard_opener::<u32>()
-        .open()
+    let name = service_name(run, env_index, "roster")?;
+    retry_on_full_disk(|| node.service_builder(&name).blackboard_opener::<u32>().open())
         .map_err(|e| refused("opening", "roster")(&e))
 }
 
@@ -277,9 +331,8 @@ pub fn open_wake(
     env_index: u32,
     process: Process,
 ) -> Result<WakeService, ServiceError> {
-    node.service_builder(&wake_name(run, env_index, process)?)
-        .event()
-        .open()
+    let name = wake_name(run, env_index, process)?;
+    retry_on_full_disk(|| node.service_builder(&name).event().open())
         .map_err(|e| refused("opening", format!("wake-up of {process}"))(&e))
 }
 
@@ -315,8 +368,8 @@ impl ServiceHolder {
     /// iceoryx2 refuses one.
     pub fn create(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<Self, ServiceError> {
         let data = Channel::ALL.into_iter().map(|channel| {
-            data_builder(node, run, env_index, channel)?
-                .create()
+            let name = data_name(run, env_index, channel)?;
+            retry_on_full_disk(|| data_builder(node, &name, run, channel).create())
                 .map_err(|e| refused("creation", channel.name())(&e))
         });
         let boards = Process::ALL.into_iter().map(|process| {
@@ -327,12 +380,12 @@ impl ServiceHolder {
             .into_iter()
             .filter(|process| env_index == 0 || process.spec().scope == ProcessScope::Environment)
             .map(|process| create_wake(node, run, env_index, process));
+        let control = service_name(run, env_index, "control")?;
         Ok(Self {
             _data: data.collect::<Result<_, _>>()?,
             boards: boards.collect::<Result<_, ServiceError>>()?,
             roster: create_roster(node, run, env_index)?,
-            control: control_builder(node, run, env_index)?
-                .create()
+            control: retry_on_full_disk(|| control_builder(node, &control).create())
                 .map_err(|e| refused("creation", "control")(&e))?,
             _wakes: wakes.collect::<Result<_, _>>()?,
         })
@@ -373,23 +426,29 @@ impl ServiceHolder {
 }
 
 fn create_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<BoardService, ServiceError> {
-    node.service_builder(&service_name(run, env_index, "roster")?)
-        .blackboard_creator::<u32>()
-        .max_readers(MAX_ROSTER_READERS)
-        .max_nodes(MAX_NODES)
-        .add(ROSTER_KEY, Roster::default())
-        .create()
-        .map_err(|e| refused("creation", "roster")(&e))
+    let name = service_name(run, env_index, "roster")?;
+    let create = || {
+        node.service_builder(&name)
+            .blackboard_creator::<u32>()
+            .max_readers(MAX_ROSTER_READERS)
+            .max_nodes(MAX_NODES)
+            .add(ROSTER_KEY, Roster::default())
+            .create()
+    };
+    retry_on_full_disk(create).map_err(|e| refused("creation", "roster")(&e))
 }
 
 fn create_wake(node: &Node<Shm>, run: &RunFile, env_index: u32, process: Process) -> Result<WakeService, ServiceError> {
     let envs = run.config.run.envs as usize;
-    node.service_builder(&wake_name(run, env_index, process)?)
-        .event()
-        .max_nodes(MAX_NODES + Process::ALL.len() * envs)
-        .max_notifiers(2 * Process::ALL.len() * envs)
-        .max_listeners(2)
-        .event_id_max_value(1)
-        .create()
-        .map_err(|e| refused("creation", format!("wake-up of {process}"))(&e))
+    let name = wake_name(run, env_index, process)?;
+    let create = || {
+        node.service_builder(&name)
+            .event()
+            .max_nodes(MAX_NODES + Process::ALL.len() * envs)
+            .max_notifiers(2 * Process::ALL.len() * envs)
+            .max_listeners(2)
+            .event_id_max_value(1)
+            .create()
+    };
+    retry_on_full_disk(create).map_err(|e| refused("creation", format!("wake-up of {process}"))(&e))
 }

@@ -1,9 +1,10 @@
 //! Files that a run depends on: written whole, flushed to disk and renamed. A full disk is waited for.
 
 use std::{
+    fmt::Debug,
     fs::File,
     io::{Error, ErrorKind, Result, Seek as _, SeekFrom, Write as _},
-    path::Path,
+    path::{Path, PathBuf},
     sync::{
         Arc, OnceLock,
         atomic::{AtomicBool, Ordering},
@@ -12,17 +13,22 @@ use std::{
 };
 
 use rustix::{
-    fs::{CWD, RenameFlags, renameat_with},
+    fs::{CWD, RenameFlags, renameat_with, statvfs},
     io::Errno,
 };
 
 /// Time between two attempts on a full disk.
 const RETRY: Duration = Duration::from_millis(100);
 
+/// Free space with which the small files of a node, a service or a port can be written, bytes.
+const SMALL_FILES_BYTES: u64 = 64 << 10;
+
+/// Where iceoryx2 writes the small files of this process's nodes, services and ports.
+static IPC_FILES: OnceLock<PathBuf> = OnceLock::new();
 /// Set when the process is asked to stop.
 static STOP: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 
-/// Ends the wait for space once `stop` is set.
+/// Ends a wait for space that has no limit once `stop` is set.
 pub fn stop_waiting_at(stop: &Arc<AtomicBool>) {
     STOP.get_or_init(|| Arc::clone(stop));
 }
@@ -54,7 +60,7 @@ pub fn wait_for_space<T>(path: &Path, limit: Duration, mut write: impl FnMut() -
     let mut has_waited = false;
     loop {
         match write() {
-            Err(error) if is_full(&error) && !is_stopped() && begin.elapsed() < limit => {
+            Err(error) if is_full(&error) && begin.elapsed() < limit && !(limit == Duration::MAX && is_stopped()) => {
                 if !has_waited {
                     tracing::warn!("the disk is full: {} waits until there is space", path.display());
                 }
@@ -68,6 +74,36 @@ pub fn wait_for_space<T>(path: &Path, limit: Duration, mut write: impl FnMut() -
                 return result;
             }
         }
+    }
+}
+
+/// From now on [`retry_on_full_disk`] looks at the disk of `root`, iceoryx2's directory. All runs of a user have theirs on one disk.
+pub(crate) fn ipc_files_are_in(root: &Path) {
+    IPC_FILES.get_or_init(|| root.to_owned());
+}
+
+/// The result of `attempt`, which creates or opens something of iceoryx2 and is called again while the disk of iceoryx2's files is full:
+/// iceoryx2 refuses then without saying why. What does not exist is not waited for.
+pub(crate) fn retry_on_full_disk<T, E: Debug>(
+    mut attempt: impl FnMut() -> std::result::Result<T, E>,
+) -> std::result::Result<T, E> {
+    let has_space = || {
+        let free = |root: &PathBuf| statvfs(root).map_or(u64::MAX, |stat| stat.f_bavail.saturating_mul(stat.f_frsize));
+        IPC_FILES.get().is_none_or(|root| free(root) >= SMALL_FILES_BYTES)
+    };
+    let mut has_waited = false;
+    loop {
+        let had_space = has_space();
+        let result = attempt();
+        let is_for_space = |error: &E| format!("{error:?}") != "DoesNotExist" && !(had_space && has_space());
+        if !result.as_ref().is_err_and(is_for_space) || is_stopped() {
+            return result;
+        }
+        if !has_waited {
+            tracing::warn!("the disk is full: shared memory is opened once there is space");
+        }
+        has_waited = true;
+        std::thread::park_timeout(RETRY);
     }
 }
 

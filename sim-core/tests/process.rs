@@ -88,6 +88,7 @@ impl Run {
             run_dir,
         };
         file.write().unwrap();
+        std::fs::create_dir_all(&file.shared_memory.root).unwrap();
         let node = services::node(&file.shared_memory).unwrap();
         let holder = Some(ServiceHolder::create(&node, &file, 0).unwrap());
         Self {

@@ -248,11 +248,10 @@ impl ProgressView {
         }
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let sim_time_s = sensing.sim_time_ns as f64 * 1e-9;
-        let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
-        let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
-        let now = usize::try_from(sensing.episode)
-            .ok()
-            .and_then(|index| episodes.get(index));
+        let counts = first.map(|first| first.run.episode_counts()).unwrap_or_default();
+        let ticks = counts.iter().map(|count| Some(count.ticks? * count.episodes));
+        let total: Option<u64> = ticks.sum();
+        let now = first.and_then(|first| first.run.episode(sensing.episode));
         Self {
             note: String::new(),
             shares: String::new(),

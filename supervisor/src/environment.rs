@@ -149,7 +149,7 @@ impl Environment {
             start,
             sensed_ticks: self.sensed_ticks,
         });
-        self.run.write()?;
+        self.run.rewrite()?;
         Ok(start.episode_tick)
     }
 

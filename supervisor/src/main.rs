@@ -23,6 +23,7 @@ use ipc_schema::run::Mode;
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
+    ipc_schema::process_main::show_warnings();
     system_limits::raise_open_files();
     system_limits::protect_files();
     let result = match cli.command {

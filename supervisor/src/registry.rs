@@ -16,6 +16,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     reserve::SHARED_MEMORY,
     run::{RunFile, SharedMemory},
+    services,
 };
 use rustix::fs::{FlockOperation, OFlags, flock};
 use serde::{Deserialize, Serialize};
@@ -340,15 +341,13 @@ fn shared_files(directory: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Removes a run's shared memory, then its directory with the lock. Failures are only logged: the next start tries again.
+/// Removes a run's shared memory and its directory with the lock. Failures are only logged: the next start tries again.
 fn remove(directory: &Path) {
-    for path in shared_files(directory) {
-        if let Err(error) = std::fs::remove_file(&path) {
-            tracing::warn!(%error, path = %path.display(), "cannot remove shared memory");
-        }
-    }
-    if let Err(error) = std::fs::remove_dir_all(directory) {
-        tracing::warn!(%error, path = %directory.display(), "cannot remove the run's directory");
+    if let Some(name) = directory.file_name() {
+        services::remove_files(&SharedMemory {
+            root: directory.to_owned(),
+            prefix: prefix(&name.to_string_lossy()),
+        });
     }
 }
 

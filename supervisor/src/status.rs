@@ -146,10 +146,8 @@ struct BoardReading {
 impl BoardReading {
     /// The state of the process for people; a process of `run` without a sign of life for too long hangs.
     fn state(&self, run: &RunFile) -> &'static str {
-        match State::from_u32(self.health.state) {
-            State::Ready | State::Running if self.activity.age_s() > run.config.run.stall_s => "stalled",
-            state => state.name(),
-        }
+        self.activity
+            .state_name(State::from_u32(self.health.state), run.config.run.stall_s)
     }
 }
 

@@ -3,7 +3,11 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     os::unix::process::ExitStatusExt as _,
-    sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel},
+    sync::{
+        Arc,
+        atomic::AtomicBool,
+        mpsc::{Receiver, RecvTimeoutError, Sender, channel},
+    },
     time::{Duration, Instant},
 };
 
@@ -12,6 +16,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     process::{OnExit, Process, ProcessSpec},
     run::RunFile,
+    storage,
 };
 use signal_hook::{
     consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
@@ -534,6 +539,12 @@ impl Supervisor {
 fn watch_signals(sender: Sender<SupervisorEvent>) -> Result<Handle, Exit> {
     let failed = |error: &std::io::Error| Exit::run(format!("cannot watch signals: {error}"), "");
     let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP, SIGCHLD]).map_err(|error| failed(&error))?;
+    // While the disk is full the supervisor may wait in the middle of its work.
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|error| failed(&error))?;
+    }
+    storage::stop_waiting_at(&stop);
     let handle = signals.handle();
     std::thread::Builder::new()
         .name("signals".into())

@@ -12,7 +12,7 @@ use std::{
     fs::File,
     os::{fd::AsRawFd as _, unix::process::ExitStatusExt as _},
     path::{Path, PathBuf},
-    process::{Command, Output, Stdio},
+    process::{Child, Command, Output, Stdio},
 };
 
 use common::{Workplace, text, until, with_mounts};
@@ -129,63 +129,132 @@ fn a_run_keeps_the_memory_that_it_reserved_when_others_fill_the_rest() {
     workplace.assert_nothing_left();
 }
 
+/// A run whose files and iceoryx2's are on a small disk, which is full once the run has a checkpoint.
+struct RunOnFullDisk {
+    run: Child,
+    /// The disk, as this process sees it, also after the run's end.
+    disk: PathBuf,
+    _held: File,
+    /// The file that fills the disk.
+    filling: PathBuf,
+    /// What the run writes to its standard error.
+    said: PathBuf,
+}
+
+impl RunOnFullDisk {
+    /// `None` if this system allows no mounts.
+    fn start(workplace: &Workplace, settings: &[&str]) -> Option<Self> {
+        let small = workplace.path().join("small");
+        std::fs::create_dir(&small).unwrap();
+        let arguments = [&train("full", settings)[..], &["--runs", "small"]].concat();
+        let mount = format!("mount -t tmpfs -o size=48m none {}", small.display());
+        let mut command = workplace.command(&arguments);
+        command.env("CARAWARE_RUNTIME_DIR", small.join("r"));
+        let mut command = with_mounts(&command, &mount)?;
+        let said = workplace.path().join("said");
+        command.stderr(File::create(&said).unwrap()).stdout(Stdio::null());
+        let mut run = command.spawn().unwrap();
+        // The run's mounts are seen through its process, and through an open directory also after its end.
+        let inside = PathBuf::from(format!("/proc/{}/root{}", run.id(), small.display()));
+        until(&mut run, "checkpoint", || {
+            inside.join("full/checkpoints/latest").exists().then_some(())
+        });
+        let held = File::open(&inside).unwrap();
+        let disk = PathBuf::from(format!("/proc/self/fd/{}", held.as_raw_fd()));
+        let filling = fill(&disk);
+        Some(Self {
+            run,
+            disk,
+            _held: held,
+            filling,
+            said,
+        })
+    }
+
+    fn wait_until_it_says(&mut self, words: &str) {
+        let said = &self.said;
+        until(&mut self.run, words, || {
+            std::fs::read_to_string(said).unwrap().contains(words).then_some(())
+        });
+    }
+
+    /// Frees the disk, and waits for the run's end. Returns its report, what it said, and what its processes have logged.
+    fn finish(mut self) -> (serde_json::Value, String, String) {
+        assert!(
+            statvfs(&self.disk).unwrap().f_bavail * 4096 < 64 << 10,
+            "the disk is not full"
+        );
+        std::fs::remove_file(&self.filling).unwrap();
+        let status = self.run.wait().unwrap();
+        let said = std::fs::read_to_string(&self.said).unwrap();
+        assert!(status.success(), "{said}");
+        let report = std::fs::read_to_string(self.disk.join("full/report.json")).unwrap();
+        let logs = std::fs::read_dir(self.disk.join("full/logs")).unwrap().flatten();
+        let logs = logs.filter_map(|entry| std::fs::read_to_string(entry.path()).ok());
+        (serde_json::from_str(&report).unwrap(), said, logs.collect())
+    }
+}
+
+impl Drop for RunOnFullDisk {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("{}", std::fs::read_to_string(&self.said).unwrap_or_default());
+        }
+    }
+}
+
 #[test]
 fn a_full_disk_is_waited_for() {
     let workplace = Workplace::new();
-    let hash = |name: &str| workplace.report(name)["observation_hash"].clone();
     let longer = ["episode.training_episodes=10"];
     workplace.succeed(&train("alone", &longer));
-    let reference = hash("alone");
-    let small = workplace.path().join("small");
-    std::fs::create_dir(&small).unwrap();
-    let arguments = [&train("full", &longer)[..], &["--runs", "small"]].concat();
-    let mount = format!("mount -t tmpfs -o size=48m none {}", small.display());
-    let Some(mut command) = with_mounts(&workplace.command(&arguments), &mount) else {
+    let reference = workplace.report("alone")["observation_hash"].clone();
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
         return;
     };
-    let said = workplace.path().join("said");
-    command.stderr(File::create(&said).unwrap()).stdout(Stdio::null());
-    let mut run = command.spawn().unwrap();
-    // The run's mounts are seen through its process, and through an open directory also after its end.
-    let inside = PathBuf::from(format!("/proc/{}/root{}", run.id(), small.display()));
-    until(&mut run, "checkpoint", || {
-        inside.join("full/checkpoints/latest").exists().then_some(())
-    });
-    let held = File::open(&inside).unwrap();
-    let inside = PathBuf::from(format!("/proc/self/fd/{}", held.as_raw_fd()));
-    let other = fill(&inside);
     // Whichever process is the first to need space waits for it.
-    until(&mut run, "notice", || {
-        std::fs::read_to_string(&said)
-            .unwrap()
-            .contains("is full")
-            .then_some(())
-    });
-    assert!(
-        statvfs(&inside).unwrap().f_bavail * 4096 < 64 << 10,
-        "the disk is not full"
-    );
-    std::fs::remove_file(other).unwrap();
-    assert!(
-        run.wait().unwrap().success(),
-        "{}",
-        std::fs::read_to_string(&said).unwrap()
-    );
-    let logs = std::fs::read_dir(inside.join("full/logs")).unwrap().flatten();
-    let logs: String = logs
-        .filter_map(|entry| std::fs::read_to_string(entry.path()).ok())
-        .collect();
-    let said = std::fs::read_to_string(&said).unwrap();
+    full.wait_until_it_says("is full");
+    let (report, said, logs) = full.finish();
     assert!(said.contains("has space again"), "{said}");
     assert!(logs.contains("there is space again"), "{logs}");
-    let report: serde_json::Value =
-        serde_json::from_str(&std::fs::read_to_string(inside.join("full/report.json")).unwrap()).unwrap();
     assert_eq!(
         (&report["result"], &report["observation_hash"]),
         (&"completed".into(), &reference)
     );
     assert_eq!((&report["lost_ticks"], &report["restarts"]), (&0.into(), &0.into()));
     assert!(report["disk_full"].as_u64().unwrap() >= 1, "{report:#}");
+}
+
+/// What dies while the disk is full is started again, and has its part of shared memory once there is space.
+#[test]
+fn processes_that_die_while_the_disk_is_full_are_replaced() {
+    let workplace = Workplace::new();
+    let longer = ["episode.training_episodes=10"];
+    workplace.succeed(&train("alone", &longer));
+    let reference = workplace.report("alone")["observation_hash"].clone();
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
+        return;
+    };
+    full.wait_until_it_says("is full");
+    let kill = |name| {
+        let pid = pid_of([name, &workplace.path().to_string_lossy()]).unwrap();
+        kill_process(pid, Signal::KILL).unwrap();
+    };
+    kill("caraware.train");
+    full.wait_until_it_says("a successor continues");
+    kill("/sim-core");
+    full.wait_until_it_says("run.json waits until there is space");
+    let (report, said, _) = full.finish();
+    assert_eq!(
+        (&report["result"], &report["observation_hash"]),
+        (&"completed".into(), &reference),
+        "{said}"
+    );
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert!(report["restarts"].as_u64().unwrap() >= 1, "{report:#}");
 }
 
 /// `command` in a shell that first runs `before`.
@@ -220,5 +289,73 @@ fn too_few_file_handles_are_an_error_that_names_the_limit() {
             .unwrap();
         assert!(output.status.success(), "{before}: {}", text(&output));
     }
+    workplace.assert_nothing_left();
+}
+
+/// A control group with a limit on memory. Dropping it removes it.
+struct LimitedGroup(PathBuf);
+
+impl LimitedGroup {
+    /// A group of either version; `None` if this user may not create one.
+    fn new(limit_mib: u64) -> Option<Self> {
+        let name = format!("caraware-test-{}", std::process::id());
+        let version_1 = (
+            "/sys/fs/cgroup/memory",
+            "memory.limit_in_bytes",
+            "memory.memsw.limit_in_bytes",
+        );
+        let version_2 = ("/sys/fs/cgroup", "memory.max", "memory.swap.max");
+        [version_1, version_2].into_iter().find_map(|(parent, limit, swap)| {
+            let group = Self(Path::new(parent).join(&name));
+            std::fs::create_dir(&group.0).ok()?;
+            // Below a directory that is no control group no such file appears.
+            let limit = group.0.join(limit);
+            let limited = limit.exists() && std::fs::write(&limit, (limit_mib << 20).to_string()).is_ok();
+            let swap = group.0.join(swap);
+            if swap.exists() {
+                let most = if swap.ends_with("memory.swap.max") {
+                    0
+                } else {
+                    limit_mib << 20
+                };
+                std::fs::write(&swap, most.to_string()).ok()?;
+            }
+            limited.then_some(group)
+        })
+    }
+}
+
+impl Drop for LimitedGroup {
+    fn drop(&mut self) {
+        // A group whose processes have just ended may need a moment.
+        for _ in 0..100 {
+            if std::fs::remove_dir(&self.0).is_ok() {
+                return;
+            }
+            std::thread::park_timeout(std::time::Duration::from_millis(50));
+        }
+    }
+}
+
+/// The kernel kills a trainer that needs more than the group's limit: the run ends with a report that says so.
+#[test]
+fn a_limit_on_memory_that_the_kernel_enforces_is_named() {
+    const LIMIT_MIB: u64 = 300;
+    let workplace = Workplace::new();
+    let Some(group) = LimitedGroup::new(LIMIT_MIB) else {
+        eprintln!("not tested: this user may not create a control group with a limit on memory");
+        return;
+    };
+    let join = format!("echo $$ > {}/cgroup.procs", group.0.display());
+    let output = in_shell(&workplace.command(&train("limited", &[])), &join)
+        .output()
+        .unwrap();
+    assert_ended_clearly(&output, "limited");
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+    let report = workplace.report("limited");
+    assert_eq!(report["result"], "failed", "{report:#}");
+    let message = report["failure"]["message"].as_str().unwrap();
+    let named = format!("the kernel has ended trainer: the limit on memory of {LIMIT_MIB} MiB was reached");
+    assert!(message.contains(&named), "{message}");
     workplace.assert_nothing_left();
 }

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 import pyarrow.dataset
 import pyarrow.parquet
@@ -23,6 +27,7 @@ from caraware.data.names import RoadUsers
 from recorded_run import recorded_run, unseen
 from torch.utils.data import DataLoader
 
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "figure.ipynb"
 SETTINGS = {
     "traffic.cavs": 5,
     "traffic.others": 3,
@@ -212,3 +217,20 @@ def test_a_damaged_recording_opens_up_to_the_damage(run_dir: Path, tmp_path: Pat
     cut.write_bytes(whole[:20])
     with pytest.raises(RecordingError, match="byte"):
         open_recording(cut)
+
+
+def test_the_notebook_makes_its_figure(run_dir: Path, recording: Recording, tmp_path: Path) -> None:
+    """Its cells run as written, on this recording, and its errors are the trainer's own."""
+    matplotlib.use("Agg")
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    for name, path in (("RECORDING", run_dir), ("FIGURE", tmp_path / "errors.pdf")):
+        code, found = re.subn(rf'(?m)^{name} = "[^"]*"', f'{name} = "{path}"', code)
+        assert found == 1
+    values: dict[str, Any] = {}
+    exec(compile(code, str(NOTEBOOK), "exec"), values)
+    assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
+    rows, errors_m = values["rows"], values["errors_m"]
+    assert len(rows) > 100 and set(rows["episode"]) == {2}
+    assert np.allclose(errors_m["policy"], rows["predicted_error_m"], rtol=1e-4)
+    assert 3 < errors_m["GNSS"].mean() < 12 and values["summary"].notna().all(axis=None)

@@ -105,3 +105,16 @@ def test_each_episode_has_its_own_names() -> None:
     seen.enter_names(wire.decode_table(frames.vehicles(2, {7: "more"}, episode=1), wire.VEHICLE_META))
     assert seen.name(7) == "more"
     assert seen.name(100) == "#0064"
+
+
+def test_a_process_that_hangs_is_named() -> None:
+    shown = picture()
+    shown.status = {
+        "processes": [
+            {"name": "sim-core", "state": "stalled", "silent_s": 312.4, "waits_for": ""},
+            {"name": "trainer", "state": "running", "silent_s": 0.01, "waits_for": "sensor-daemon"},
+        ]
+    }
+    text = hud(shown, MAP, [], ViewerFigures())
+    assert "| hangs | sim-core: no sign of life for 312 s |" in text
+    assert text.count("hangs") == 1

@@ -175,8 +175,20 @@ class PanelPage:
             "const top = document.elementFromPoint(...at);"
             "return top && (top === e || e.contains(top)) ? at : null; })()"
         )
-        self.wait(f"{place} !== null")
-        self.click_at(*self.browser.evaluate(place))
+        # The page may move it between the look and the click, which then hits something else: such a click is repeated.
+        hit = (
+            "window.hit = null; document.addEventListener('click', (event) => {"
+            f"window.hit = event.composedPath().includes({found}); }}, {{once: true, capture: true}}); true"
+        )
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            self.wait(f"{place} !== null")
+            self.browser.evaluate(f"(() => {{ {hit} }})()")
+            if (at := self.browser.evaluate(place)) is not None:
+                self.click_at(*at)
+                if self.browser.evaluate("window.hit") is True:
+                    return
+            assert time.monotonic() < deadline, f"no click hits {element}"
 
     def click_text(self, scope: str, text: str) -> None:
         """Clicks on the button with this text."""

@@ -7,7 +7,7 @@ use std::{
 
 use caraware::{failure::Exit, install::Install};
 
-use super::target::Target;
+use crate::target::Target;
 
 /// Settings of both cases: few road users, short episodes with evaluations between, a checkpoint after every second update.
 const SETTINGS: [&str; 6] = [

@@ -20,10 +20,9 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-use super::{
-    case::EnduranceCase,
-    target::{Target, processes_of, resources, signal},
-};
+use super::case::EnduranceCase;
+use crate::free_port;
+use crate::target::{CountedMemory, Target, processes_of, resources, signal};
 
 /// Interval at which the resources of all processes are read, which costs some milliseconds.
 const LOOK_INTERVAL: Duration = Duration::from_millis(250);
@@ -33,26 +32,26 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 const DEADLINE: Duration = Duration::from_secs(300);
 /// Longest pause of a stopped process, seconds.
 const LONGEST_PAUSE_S: f64 = 1.5;
-/// Cards of the deck that a run draws.
-const DISTURBANCES: usize = 14;
 /// Mean distance of two disturbances, seconds.
-const MEAN_S: f64 = 1.2;
+const MEAN_S: f64 = 0.8;
+/// A larger file of a run with faults is not kept.
+const MOST_KEPT_BYTES: u64 = 4 << 20;
 /// Viewers at once.
 const VIEWERS: usize = 3;
-/// What is done, and how many cards of the deck each has.
+/// What is done, and how many cards of the deck each has: a run draws them all.
 const DECK: [(Disturbance, usize); 12] = [
-    (Disturbance::Kill(Target::Trainer), 6),
-    (Disturbance::Kill(Target::TrafficBridge), 2),
-    (Disturbance::Kill(Target::SimCore), 2),
-    (Disturbance::Kill(Target::SensorDaemon), 2),
-    (Disturbance::Kill(Target::V2x), 2),
-    (Disturbance::Kill(Target::Fanout), 2),
-    (Disturbance::Kill(Target::Recorder), 2),
+    (Disturbance::Kill(Target::Trainer), 10),
+    (Disturbance::Kill(Target::TrafficBridge), 3),
+    (Disturbance::Kill(Target::SimCore), 3),
+    (Disturbance::Kill(Target::SensorDaemon), 3),
+    (Disturbance::Kill(Target::V2x), 3),
+    (Disturbance::Kill(Target::Fanout), 3),
+    (Disturbance::Kill(Target::Recorder), 3),
     (Disturbance::Kill(Target::Supervisor), 1),
     (Disturbance::Pause, 2),
     (Disturbance::Handover, 2),
-    (Disturbance::Viewer, 3),
-    (Disturbance::FullDisk, 2),
+    (Disturbance::Viewer, 4),
+    (Disturbance::FullDisk, 1),
 ];
 
 /// What is done to a run.
@@ -64,7 +63,7 @@ enum Disturbance {
     Pause,
     /// Our trainer is replaced by its successor.
     Handover,
-    /// A viewer is started, or one is killed or stopped.
+    /// A viewer is killed or stopped, and others are started.
     Viewer,
     /// The disk of the runs is full for a while.
     FullDisk,
@@ -75,6 +74,8 @@ enum Disturbance {
 pub struct EnduranceCounts {
     /// Disturbances by name.
     pub disturbances: BTreeMap<String, u32>,
+    /// Handovers that were refused or given up, by the first line of the reason.
+    pub refusals: BTreeMap<String, u32>,
     /// Runs that have completed.
     pub runs: u32,
     /// Times that a run was resumed.
@@ -122,6 +123,14 @@ impl EndurancePlace {
     #[must_use]
     pub fn registry(&self) -> PathBuf {
         self.directory.join("r")
+    }
+
+    /// Where the logs of a run with faults stay after the measurement.
+    #[must_use]
+    pub fn kept(&self, name: &str) -> PathBuf {
+        let mut kept = self.directory.as_os_str().to_owned();
+        kept.push("-faults");
+        Path::new(&kept).join(name)
     }
 
     /// Directory of a run.
@@ -231,6 +240,8 @@ impl<'a> DisturbedRun<'a> {
                 }
                 if status.signal() != Some(Signal::KILL.as_raw()) {
                     self.fault(&format!("ended with {status}: {}", self.last_words()));
+                    self.watched = None;
+                    self.check_left_behind();
                     return Ok(None);
                 }
                 self.resume()?;
@@ -288,7 +299,10 @@ impl<'a> DisturbedRun<'a> {
                 Target::Supervisor => vec![pid(&self.child)],
                 _ => target.processes(&directory),
             };
-            for (resident_mib, handles) in pids.into_iter().filter_map(resources) {
+            for (resident_mib, handles) in pids
+                .into_iter()
+                .filter_map(|pid| resources(pid, CountedMemory::Resident))
+            {
                 let peak = self.counts.peaks.entry(target).or_default();
                 *peak = (peak.0.max(resident_mib), peak.1.max(handles));
             }
@@ -392,21 +406,46 @@ impl<'a> DisturbedRun<'a> {
         Ok(is_stopped)
     }
 
-    /// Asks for a handover, after the next update or at once. It may be refused, for instance because another one is in progress.
+    /// Asks for a handover, after the next update or at once. It may be refused, for instance because the trainer was killed meanwhile.
     fn hand_over(&mut self) -> Result<bool, Exit> {
+        if self.watched.is_none() {
+            return Ok(false);
+        }
         let mut arguments = vec!["handover".to_owned(), self.name.clone()];
         if self.random.bool() {
             arguments.push("--now".into());
         }
-        let client = self.place.command(&arguments).stderr(Stdio::null()).spawn();
-        self.handovers
-            .push(client.map_err(|error| Exit::io("start", &self.place.caraware, &error))?);
+        let client = self.place.command(&arguments).stderr(Stdio::piped()).spawn();
+        let client = client.map_err(|error| Exit::io("start", &self.place.caraware, &error))?;
         self.counts.count("handover asked for");
-        Ok(true)
+        // Every second time the next disturbance may come amid the handover.
+        if self.random.bool() {
+            self.handovers.push(client);
+            return Ok(true);
+        }
+        self.count_handover(client)
     }
 
+    /// Waits for the end of a handover. Returns false if it was not made.
+    fn count_handover(&mut self, client: Child) -> Result<bool, Exit> {
+        let output = client.wait_with_output();
+        let output = output.map_err(|error| Exit::io("wait for", &self.place.caraware, &error))?;
+        if output.status.success() {
+            self.counts.count("handover made");
+            return Ok(true);
+        }
+        self.counts.count("handover refused or given up");
+        let text = String::from_utf8_lossy(&output.stderr);
+        let line = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
+        // Numbers differ from run to run.
+        let reason = line.trim().replace(|letter: char| letter.is_ascii_digit(), "#");
+        *self.counts.refusals.entry(reason).or_default() += 1;
+        Ok(false)
+    }
+
+    /// Kills a viewer, or stops one for good every fourth time. There are always some.
     fn disturb_viewers(&mut self) -> Result<bool, Exit> {
-        if self.viewers.len() < VIEWERS {
+        while self.viewers.len() < VIEWERS {
             let viewer = Command::new(&self.place.watch)
                 .args([&format!("tcp/127.0.0.1:{}", self.port), &self.name, "--seconds", "600"])
                 .stdin(Stdio::null())
@@ -416,18 +455,21 @@ impl<'a> DisturbedRun<'a> {
             self.viewers
                 .push(viewer.map_err(|error| Exit::io("start", &self.place.watch, &error))?);
             self.counts.count("viewer started");
-            return Ok(true);
         }
         let index = self.random.usize(0..self.viewers.len());
-        if self.random.bool() {
+        if self.random.usize(0..4) == 0 {
             signal(pid(&self.viewers[index]), Signal::STOP);
             self.counts.count("viewer stopped");
         } else {
             let mut viewer = self.viewers.swap_remove(index);
-            // A viewer whose run has ended may have ended as well.
+            let is_alive = matches!(viewer.try_wait(), Ok(None));
+            // A viewer whose fan-out has ended may have ended as well.
             let _ = viewer.kill();
             let _ = viewer.wait();
-            self.counts.count("viewer killed");
+            self.counts.count(match is_alive {
+                true => "viewer killed",
+                false => "viewer had ended with its fan-out",
+            });
         }
         Ok(true)
     }
@@ -462,25 +504,31 @@ impl<'a> DisturbedRun<'a> {
     fn finish(mut self) -> Result<Option<Value>, Exit> {
         self.counts.runs += 1;
         self.watched = None;
-        for mut client in std::mem::take(&mut self.handovers) {
-            let status = client.wait();
-            let status = status.map_err(|error| Exit::io("wait for", &self.place.caraware, &error))?;
-            self.counts.count(if status.success() {
-                "handover made"
-            } else {
-                "handover refused"
-            });
+        for client in std::mem::take(&mut self.handovers) {
+            self.count_handover(client)?;
         }
-        let left = self.left_behind();
-        if !left.is_empty() {
-            self.fault(&format!("left behind: {}", left.join(", ")));
-        }
+        self.check_left_behind();
         let path = self.directory().join("report.json");
         let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         let report = serde_json::from_str(&text);
         Ok(Some(report.map_err(|error| {
             Exit::run(format!("{}: {error}", path.display()), "")
         })?))
+    }
+
+    /// Adds a fault for what outlives the run, and removes it from the registry: the next run leaves it behind as well otherwise.
+    fn check_left_behind(&mut self) {
+        let left = self.left_behind();
+        if !left.is_empty() {
+            self.fault(&format!("left behind: {}", left.join(", ")));
+        }
+        for name in names_in(&self.place.registry()) {
+            let path = self.place.registry().join(&name);
+            let moved = self.place.kept(&self.name).join(name);
+            if let Err(error) = fs::rename(&path, &moved).or_else(|_| fs::remove_dir_all(&path)) {
+                tracing::warn!(%error, path = %path.display(), "cannot be removed");
+            }
+        }
     }
 
     /// Processes, files in shared memory and entries of the registry that outlive the run.
@@ -492,8 +540,19 @@ impl<'a> DisturbedRun<'a> {
         processes.chain(files).chain(names_in(&self.place.registry())).collect()
     }
 
+    /// Adds a fault, and keeps what the run has logged.
     fn fault(&mut self, text: &str) {
-        self.counts.faults.push(format!("run {}: {text}", self.name));
+        let kept = self.place.kept(&self.name);
+        let copied = copy_logs(&self.directory(), &kept).and_then(|()| {
+            let words = words_path(self.place, &self.name);
+            fs::copy(words, kept.join("standard-error.txt")).map(|_| ())
+        });
+        if let Err(error) = copied {
+            tracing::warn!(%error, path = %kept.display(), "cannot keep a run's logs");
+        }
+        let text = format!("run {}: {text} (its logs are in {})", self.name, kept.display());
+        caraware::display::notice(&text);
+        self.counts.faults.push(text);
     }
 
     /// The end of what the run has written to its standard error.
@@ -504,7 +563,7 @@ impl<'a> DisturbedRun<'a> {
     }
 }
 
-/// What is done to a run: some cards of the shuffled deck, or each kind once if the measurement is quick.
+/// What is done to a run: the shuffled deck, or each kind once if the measurement is quick.
 fn draw_cards(place: &EndurancePlace, case: &EnduranceCase, random: &mut fastrand::Rng) -> Vec<Disturbance> {
     let is_possible = |(disturbance, _): &(Disturbance, usize)| match disturbance {
         Disturbance::Kill(target) => case.has(*target),
@@ -517,12 +576,26 @@ fn draw_cards(place: &EndurancePlace, case: &EnduranceCase, random: &mut fastran
     let possible = DECK.into_iter().filter(is_possible);
     let mut cards: Vec<Disturbance> = possible.flat_map(of_kind).collect();
     random.shuffle(&mut cards);
-    cards.truncate(DISTURBANCES);
     cards
 }
 
 /// Simulated seconds per second of a disturbed run: slow enough that its disturbances meet every part of it.
 const PACE: f64 = 6.0;
+
+/// Copies a run's logs, events and small files, without its checkpoints and recordings.
+fn copy_logs(from: &Path, to: &Path) -> std::io::Result<()> {
+    fs::create_dir_all(to)?;
+    for entry in fs::read_dir(from)? {
+        let entry = entry?;
+        let (name, kind) = (entry.file_name(), entry.file_type()?);
+        if kind.is_dir() && name != "checkpoints" {
+            copy_logs(&entry.path(), &to.join(name))?;
+        } else if kind.is_file() && entry.metadata()?.len() < MOST_KEPT_BYTES {
+            fs::copy(entry.path(), to.join(name))?;
+        }
+    }
+    Ok(())
+}
 
 fn words_path(place: &EndurancePlace, name: &str) -> PathBuf {
     place.directory.join(format!("{name}.stderr"))
@@ -548,11 +621,4 @@ fn pid(child: &Child) -> Pid {
 
 fn pause() {
     std::thread::park_timeout(POLL_INTERVAL);
-}
-
-fn free_port() -> Result<u16, Exit> {
-    std::net::TcpListener::bind("127.0.0.1:0")
-        .and_then(|listener| listener.local_addr())
-        .map(|address| address.port())
-        .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
 }

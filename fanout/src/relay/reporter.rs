@@ -75,13 +75,8 @@ impl StatusReporter {
     /// The state of the run at `now`.
     pub fn status(&mut self, run: &RunFile, now: Duration, ticks: &TickTopics, counters: FanoutCounters) -> RunStatus {
         self.rate.update(now, ticks.ticks());
-        let health: Vec<_> = self
-            .boards
-            .iter()
-            .map(|(process, board)| (*process, board.health()))
-            .collect();
         // The first process is traffic-bridge: its ticks are SUMO's.
-        let sumo_ticks = health.first().map_or(0, |(_, health)| health.ticks);
+        let sumo_ticks = self.boards.first().map_or(0, |(_, board)| board.health().ticks);
         let (newest, figures) = (ticks.newest(), ticks.figures());
         let tick_s = run.config.run.tick_s;
         #[expect(
@@ -107,9 +102,12 @@ impl StatusReporter {
             road_users: figures.road_users,
             sensors: figures.sensors,
             errors_m: figures.errors_m,
-            processes: health
+            processes: self
+                .boards
                 .iter()
-                .map(|(process, health)| ProcessStatus::of(*process, health, sumo_ticks))
+                .map(|(process, board)| {
+                    ProcessStatus::of(run, *process, &board.health(), &board.activity(), sumo_ticks)
+                })
                 .collect(),
             training: run.mode.has_trainer().then(|| self.trainer_board.training()),
             fanout: counters,

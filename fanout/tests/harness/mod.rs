@@ -101,6 +101,7 @@ impl Run {
         settings.observation_hz = rate_hz;
         settings.prediction_hz = rate_hz;
         let path = file.write().unwrap();
+        std::fs::create_dir_all(&file.shared_memory.root).unwrap();
         let node = services::node(&file.shared_memory).unwrap();
         let holder = ServiceHolder::create(&node, &file, 0).unwrap();
         Self {

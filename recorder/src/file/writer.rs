@@ -4,6 +4,7 @@ use std::{
     collections::BTreeMap,
     fs::{File, OpenOptions},
     io::{Seek as _, SeekFrom, Write},
+    num::NonZero,
     path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
@@ -21,13 +22,22 @@ const CHUNK_WITHIN: Duration = Duration::from_secs(2);
 /// Bytes of a message header.
 const HEADER_BYTES: usize = size_of::<MessageHeader>();
 
+/// Threads that compress while the next messages are taken in: one, and two where enough cores are there for a run beside them.
+fn compression_threads() -> u32 {
+    match std::thread::available_parallelism().map_or(1, NonZero::get) {
+        0..6 => 1,
+        _ => 2,
+    }
+}
+
 /// What the MCAP writer has written and the file does not have yet.
 #[derive(Debug, Clone, Default)]
 struct PendingBytes(Arc<Mutex<Vec<u8>>>);
 
 impl PendingBytes {
-    fn take(&self) -> Vec<u8> {
-        std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    /// Moves the bytes behind those of `unwritten`. Both keep their memory: without it each chunk would ask the system for new pages.
+    fn move_to(&self, unwritten: &mut Vec<u8>) {
+        unwritten.append(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
     }
 }
 
@@ -132,7 +142,7 @@ impl RecordingWriter {
             .profile(PROFILE)
             .library(concat!("caraware ", env!("CARGO_PKG_VERSION")))
             .compression_level(compression_level)
-            .compression_threads(0)
+            .compression_threads(compression_threads())
             .chunk_size(None)
             .disable_seeking(true);
         let format = |error: mcap::McapError| format_error(path, &error);
@@ -311,7 +321,7 @@ impl RecordingWriter {
     /// # Errors
     /// The file cannot be written.
     pub fn write_rest(&mut self) -> Result<(), RecordingError> {
-        self.unwritten.append(&mut self.pending.take());
+        self.pending.move_to(&mut self.unwritten);
         let written = self.file.write_all(&self.unwritten);
         if let Err(source) = written {
             let cut = self.file.set_len(self.len);

@@ -370,33 +370,30 @@ fn gravity_body<'r>(
             }
         }
     }
-    let mut gravity = [[0.0; BATCH]; 3];
-    for member in 0..BATCH {
-        let (cos_pitch, sin_pitch) = cos_sin(pitch[member]);
-        let (cos_roll, sin_roll) = cos_sin(roll[member]);
-        let end = [
-            gravity_mps2 * sin_pitch,
-            gravity_mps2 * cos_pitch * sin_roll,
-            gravity_mps2 * cos_pitch * cos_roll,
-        ];
-        // Turned back to the second order of the angle.
-        let angle = left.map(|axis| axis[member]);
-        let first = cross(angle, end);
-        let second = cross(angle, first);
-        for axis in 0..3 {
-            gravity[axis][member] = end[axis] + (first[axis] + 0.5 * second[axis]);
-        }
+    // Plain arrays, one a component: what the compiler turns into vectors.
+    let [mut end_x, mut end_y, mut end_z] = [[0.0; BATCH]; 3];
+    for i in 0..BATCH {
+        let (cos_pitch, sin_pitch) = cos_sin(pitch[i]);
+        let (cos_roll, sin_roll) = cos_sin(roll[i]);
+        end_x[i] = gravity_mps2 * sin_pitch;
+        end_y[i] = gravity_mps2 * cos_pitch * sin_roll;
+        end_z[i] = gravity_mps2 * cos_pitch * cos_roll;
     }
-    gravity
-}
-
-#[inline(always)]
-fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
-    [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    // Turned back by the rotation vector a, to the second order of its angle: g + a × g + a × (a × g) / 2.
+    let [left_x, left_y, left_z] = left;
+    let [mut x, mut y, mut z] = [[0.0; BATCH]; 3];
+    for i in 0..BATCH {
+        let first_x = left_y[i] * end_z[i] - left_z[i] * end_y[i];
+        let first_y = left_z[i] * end_x[i] - left_x[i] * end_z[i];
+        let first_z = left_x[i] * end_y[i] - left_y[i] * end_x[i];
+        let second_x = left_y[i] * first_z - left_z[i] * first_y;
+        let second_y = left_z[i] * first_x - left_x[i] * first_z;
+        let second_z = left_x[i] * first_y - left_y[i] * first_x;
+        x[i] = end_x[i] + (first_x + 0.5 * second_x);
+        y[i] = end_y[i] + (first_y + 0.5 * second_y);
+        z[i] = end_z[i] + (first_z + 0.5 * second_z);
+    }
+    [x, y, z]
 }
 
 /// An angle in units of 2⁻³² turns, without whole turns. The last bit of a number between 2²⁰ and 2²¹ is one such unit: the addition

@@ -167,7 +167,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("run.window_ticks", "ticks", 1, 256, "Ticks that `traffic-bridge`, `sim-core` and `sensor-daemon` may each be ahead of the next process. Where a SUMO step has several ticks, `traffic-bridge` may be at least three steps ahead."),
     integer("run.journal_mib", "MiB", 1, 1_048_576, "Limit of memory (the first 64) and disk for the journal, from which a restarted trainer receives observations again. At the limit the oldest are dropped."),
     float("run.real_time_factor", "s/s", 0.0, 1000.0, "Simulated seconds per wall second; 0 = as fast as possible."),
-    float("run.stall_s", "s", 1.0, 1e6, "A process that makes no progress for this long, although no other process holds it up, hangs: it is named in its log, in the progress line and by `caraware ps`. It must be longer than the longest SUMO step and the longest update."),
+    float("run.stall_s", "s", 1.0, 1e6, "A process that makes no progress for this long, although no other process holds it up, hangs: it is named in its log, in the progress line, by `caraware ps` and in the viewer. It must be longer than the longest SUMO step and the longest update."),
     other("run.on_stall", ValueKind::Choice(&["report", "replace"]), "What else happens to a process that hangs: \"report\", nothing; \"replace\", it is killed and started again, as after any death."),
     float("traffic.step_s", "s", 0.001, 10.0, "Length of a SUMO step: a whole number of ticks. Unset with a `.sumocfg` = its `step-length`, and a tick that divides it (unless `run.tick_s` is set)."),
     integer("traffic.cavs", "vehicles", 0, 100_000, "Connected vehicles kept alive on random routes (maps with population control); at least 1, except in the driving task."),

@@ -20,7 +20,7 @@ use ipc_schema::{
     ports::{BoardReader, ControlServer, Subscriber},
     process::Process,
     run::{RunMap, Source},
-    schedule::Episode,
+    schedule::{Episode, EpisodeCount},
     services::Channel,
     traffic::MetaEvent,
 };
@@ -263,12 +263,12 @@ impl Bridge {
             let steps = (duration_s / sumo.step_s()).ceil() as u64;
             steps * per_step
         });
-        let ticks = |episode: &Episode| {
-            episode
-                .ticks
-                .map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
+        let ticks = |count: EpisodeCount| {
+            let of_one = count.ticks;
+            count.episodes * of_one.map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
         };
-        let total_ticks: u64 = self.membership.run.episodes().iter().map(ticks).sum();
+        let counts = self.membership.run.episode_counts();
+        let total_ticks: u64 = counts.into_iter().map(ticks).sum();
         let total_ticks = match total_ticks {
             0 => 0,
             ticks => ticks + self.totals.repeated_ticks,

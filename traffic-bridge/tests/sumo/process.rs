@@ -48,6 +48,7 @@ impl Run {
         }
         let file = run_file(run_dir, source, ticks, step_s);
         let path = file.write().unwrap();
+        std::fs::create_dir_all(&file.shared_memory.root).unwrap();
         let node = services::node(&file.shared_memory).unwrap();
         let holder = ServiceHolder::create(&node, &file, 0).unwrap();
         Self {
@@ -204,7 +205,10 @@ fn episodes_are_sent_step_by_step_under_credit() {
         assert_eq!(header.has(LAST_OF_EPISODE), step == 15);
         assert_eq!(header.has(LAST_OF_RUN), place == 29);
     }
-    let seeds: Vec<u64> = run.file.episodes().iter().map(|episode| episode.seed).collect();
+    let seeds: Vec<u64> = (0..)
+        .map_while(|index| run.file.episode(index))
+        .map(|episode| episode.seed)
+        .collect();
     assert_eq!([steps[0].0.episode_seed, steps[29].0.episode_seed], seeds[..]);
     for episode in steps.chunks(15) {
         let departed: Vec<_> = episode

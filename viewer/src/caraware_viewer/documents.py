@@ -111,6 +111,15 @@ class TrainingStatus(TypedDict, total=False):
     metrics: list[MetricStatus]
 
 
+class ProcessStatus(TypedDict):
+    """A process of the run."""
+
+    name: str
+    state: str
+    silent_s: float
+    waits_for: str
+
+
 class RunStatus(TypedDict, total=False):
     """The topic `status`."""
 
@@ -122,6 +131,7 @@ class RunStatus(TypedDict, total=False):
     real_time_factor: float
     road_users: RoadUserCounts
     training: TrainingStatus | None
+    processes: list[ProcessStatus]
 
 
 class CommandDone(TypedDict):

@@ -10,7 +10,7 @@ import numpy as np
 
 from caraware_viewer import wire
 from caraware_viewer.detail import sampling_order
-from caraware_viewer.documents import RunMap, RunStatus, TrainingStatus
+from caraware_viewer.documents import ProcessStatus, RunMap, RunStatus, TrainingStatus
 from caraware_viewer.layout import SENSORS
 from caraware_viewer.pairing import mean_m
 from caraware_viewer.picture import Picture
@@ -51,6 +51,11 @@ def hud(picture: Picture, run_map: RunMap, followed: Sequence[int], viewer: View
     return "\n\n".join(block for block in blocks if block)
 
 
+def hanging(status: RunStatus) -> list[ProcessStatus]:
+    """The processes of the run that have given no sign of life for `run.stall_s`."""
+    return [process for process in status.get("processes") or () if process["state"] == "stalled"]
+
+
 def _run(picture: Picture, run_map: RunMap, viewer: ViewerFigures) -> str:
     status = picture.status
     training = status.get("training") or TrainingStatus()
@@ -62,6 +67,9 @@ def _run(picture: Picture, run_map: RunMap, viewer: ViewerFigures) -> str:
         ("simulation", _speed(status, training)),
         ("road users", _counts(picture, run_map)),
         ("sensors on", _sensors(picture)),
+    ]
+    rows += [
+        ("hangs", f"{process['name']}: no sign of life for {process['silent_s']:.0f} s") for process in hanging(status)
     ]
     if training.get("updates"):
         best = training.get("best_reward")

@@ -17,7 +17,7 @@ from caraware_viewer.canvas import Canvas
 from caraware_viewer.course import Course
 from caraware_viewer.detail import Detail, Region
 from caraware_viewer.documents import RoadUserCounts, RunMap, RunStatus
-from caraware_viewer.hud import ViewerFigures, hud
+from caraware_viewer.hud import ViewerFigures, hanging, hud
 from caraware_viewer.legend import draw_legend
 from caraware_viewer.link import CLOUD_PREFIX, WHOLE_COURSE, Sample
 from caraware_viewer.pairing import Pairing, distances, mean_m
@@ -204,12 +204,15 @@ class Scene:
             self._canvas.scalar(plots.SPEED, float(np.hypot(*rows[0]["velocity_body_mps"][:2])))
         figures = self._figures()
         self._tally.add(self._drawn_at[-1], sample.age_ms(), figures)
-        text = hud(self._picture, self._map, followed, figures)
-        self._canvas.log(HUD, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self._draw_hud(figures)
         if self._canvas.live_bytes - self._repeated_bytes > _REPEAT_BYTES:
             self._canvas.repeat_static()
             self._course.repeat(self._canvas)
             self._repeated_bytes = self._canvas.live_bytes
+
+    def _draw_hud(self, figures: ViewerFigures) -> None:
+        text = hud(self._picture, self._map, self._picture.followed(), figures)
+        self._canvas.log(HUD, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def _figures(self) -> ViewerFigures:
         times = self._drawn_at
@@ -334,6 +337,9 @@ class Scene:
             self._picture.status = status
             self._canvas.set_tick(tick)
             plots.plot_status(self._canvas, status, _steps_per_s(status))
+            # Where a process hangs, no tick comes that would draw the text.
+            if hanging(status):
+                self._draw_hud(self._figures())
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FrameError(f"a status of {len(payload)} bytes cannot be read: {error!r}") from error
 

@@ -93,13 +93,26 @@ pub fn signal(pid: Pid, signal: Signal) -> bool {
     kill_process(pid, signal).is_ok()
 }
 
-/// Resident memory (MiB) and open handles of a process; `None` if it has ended.
+/// Memory of a process that is counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CountedMemory {
+    /// All that is resident.
+    Resident,
+    /// What is resident and belongs to the process alone: neither shared memory, whose pages count once they have been touched, nor files.
+    Private,
+}
+
+/// Memory (MiB) and open handles of a process; `None` if it has ended.
 #[must_use]
-pub fn resources(pid: Pid) -> Option<(f64, f64)> {
+pub fn resources(pid: Pid, memory: CountedMemory) -> Option<(f64, f64)> {
+    let key = match memory {
+        CountedMemory::Resident => "VmRSS:",
+        CountedMemory::Private => "RssAnon:",
+    };
     let directory = format!("/proc/{}", pid.as_raw_nonzero());
     let status = fs::read_to_string(format!("{directory}/status")).ok()?;
-    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
-    let resident_kib: f64 = resident.trim().trim_end_matches("kB").trim().parse().ok()?;
+    let counted = status.lines().find_map(|line| line.strip_prefix(key))?;
+    let counted_kib: f64 = counted.trim().trim_end_matches("kB").trim().parse().ok()?;
     let handles = fs::read_dir(format!("{directory}/fd")).ok()?.count();
-    Some((resident_kib / 1024.0, handles as f64))
+    Some((counted_kib / 1024.0, handles as f64))
 }

@@ -1,0 +1,357 @@
+//! Watches one long run with viewers and handovers: does the memory or the number of handles of a process grow, do the logs?
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use caraware::{failure::Exit, install};
+use rustix::process::{Pid, Signal};
+use serde_json::Value;
+
+use super::{BenchOptions, BenchReport, ReportTable, free_port, sides::BenchDirectory};
+use crate::target::{CountedMemory, Target, resources, signal};
+
+const NAME: &str = "soak";
+/// A run without end in short episodes, with messages between vehicles, at full speed.
+const SETTINGS: [&str; 6] = [
+    "v2x.share=0.5",
+    "episode.ticks=600",
+    "episode.training_episodes=1000000",
+    "episode.evaluation_interval=20",
+    "trainer.horizon=4096",
+    "trainer.checkpoint_interval=10",
+];
+const VIEWERS: usize = 2;
+/// Shortest watch whose growth is judged: a shorter one sees what a process needs at first.
+const JUDGED_H: f64 = 0.5;
+/// Part of the watch that is not counted, while the process fills what it keeps.
+const FILLING: f64 = 0.2;
+/// Largest growth of a process that is no fault, MiB per hour and handles per hour.
+const MOST_GROWTH: (f64, f64) = (1.0, 2.0);
+const DEADLINE: Duration = Duration::from_secs(300);
+
+/// A process, or all of its kind, at one moment.
+#[derive(Debug, Clone, Copy)]
+struct SoakSample {
+    at_h: f64,
+    private_mib: f64,
+    handles: f64,
+}
+
+/// Watches a run for as long as `options` say.
+///
+/// # Errors
+/// The run cannot be started, ends by itself, or cannot be stopped. What grows is in the report's faults.
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
+    let (time, interval, handover_interval) = match options.quick {
+        true => (Duration::from_secs(30), Duration::from_secs(1), Duration::from_secs(12)),
+        false => (
+            Duration::from_secs(60 * options.minutes),
+            Duration::from_secs(10),
+            Duration::from_secs(300),
+        ),
+    };
+    let directory = BenchDirectory::new(NAME)?;
+    let mut run = SoakRun::start(options, directory.path())?;
+    run.wait_for_update()?;
+    let begun = Instant::now();
+    let mut samples: BTreeMap<Target, Vec<SoakSample>> = BTreeMap::new();
+    let mut logs: Vec<(f64, f64)> = Vec::new();
+    let mut handover_due = handover_interval;
+    while begun.elapsed() < time {
+        run.check_alive()?;
+        let at_h = begun.elapsed().as_secs_f64() / 3600.0;
+        for target in Target::ALL {
+            if let Some((private_mib, handles)) = run.resources(target) {
+                samples.entry(target).or_default().push(SoakSample {
+                    at_h,
+                    private_mib,
+                    handles,
+                });
+            }
+        }
+        logs.push((at_h, size_mib(&run.directory, &["checkpoints"])));
+        if begun.elapsed() >= handover_due {
+            run.hand_over()?;
+            handover_due += handover_interval;
+        }
+        std::thread::park_timeout(interval);
+    }
+    let (handovers, final_report) = (run.handovers, run.stop()?);
+    let mut report = BenchReport::new(
+        NAME,
+        "Memory, handles and logs of a long run",
+        format!(
+            "The town with messages between vehicles, at full speed without end, {VIEWERS} viewers that count frames, {handovers} handovers \
+             after an update or at once in turn, watched for {:.1} h. The memory is that which belongs to a process alone (RssAnon). Growth \
+             is the slope of the line through all samples but those of the first {:.0} %.",
+            time.as_secs_f64() / 3600.0,
+            100.0 * FILLING
+        ),
+    );
+    report.command = format!("caraware bench soak --minutes {}", options.minutes);
+    report.figure("ticks", final_report["ticks"].as_f64().unwrap_or(f64::NAN));
+    report.figure("handovers", f64::from(handovers));
+    add_growth(&mut report, &samples, &logs, time.as_secs_f64() / 3600.0);
+    for key in ["lost_ticks", "duplicated_ticks"] {
+        if final_report[key] != 0 {
+            report.faults.push(format!("{key} is {}", final_report[key]));
+        }
+    }
+    Ok(report)
+}
+
+/// Adds the growth of each process and of the logs, and a fault for what grows too fast in a watch that is long enough.
+fn add_growth(
+    report: &mut BenchReport,
+    samples: &BTreeMap<Target, Vec<SoakSample>>,
+    logs: &[(f64, f64)],
+    watched_h: f64,
+) {
+    let mut table = ReportTable::new(
+        "growth",
+        &[
+            "process",
+            "memory at first (MiB)",
+            "at last",
+            "growth (MiB/h)",
+            "handles at first",
+            "at last",
+            "growth (1/h)",
+        ],
+    );
+    for (target, samples) in samples {
+        let memory: Vec<_> = samples.iter().map(|sample| (sample.at_h, sample.private_mib)).collect();
+        let handles: Vec<_> = samples.iter().map(|sample| (sample.at_h, sample.handles)).collect();
+        let [memory, handles] = [memory, handles].map(|values| Growth::of(&values));
+        table.row([
+            target.name().into(),
+            format!("{:.1}", memory.first),
+            format!("{:.1}", memory.last),
+            format!("{:+.2}", memory.per_h),
+            format!("{:.0}", handles.first),
+            format!("{:.0}", handles.last),
+            format!("{:+.2}", handles.per_h),
+        ]);
+        report.figure(format!("{}, MiB/h", target.name()), memory.per_h);
+        report.figure(format!("{}, handles/h", target.name()), handles.per_h);
+        if watched_h >= JUDGED_H && (memory.per_h > MOST_GROWTH.0 || handles.per_h > MOST_GROWTH.1) {
+            report.faults.push(format!(
+                "{} grows by {:.2} MiB and {:.2} handles an hour",
+                target.name(),
+                memory.per_h,
+                handles.per_h
+            ));
+        }
+    }
+    let files = Growth::of(logs);
+    table.row([
+        "files of the run without checkpoints".into(),
+        format!("{:.1}", files.first),
+        format!("{:.1}", files.last),
+        format!("{:+.2}", files.per_h),
+        String::new(),
+        String::new(),
+        String::new(),
+    ]);
+    report.figure("files of the run without checkpoints, MiB/h", files.per_h);
+    report.tables.push(table);
+}
+
+/// How a value changes over a watch.
+#[derive(Debug, Clone, Copy)]
+struct Growth {
+    first: f64,
+    last: f64,
+    /// Slope of the line of least squares, per hour.
+    per_h: f64,
+}
+
+impl Growth {
+    /// The growth of a value, given as hours and values, without those of the filling.
+    fn of(values: &[(f64, f64)]) -> Self {
+        let watched_h = values.last().map_or(0.0, |(at_h, _)| *at_h);
+        let counted: Vec<(f64, f64)> = values
+            .iter()
+            .copied()
+            .filter(|(at_h, _)| *at_h >= FILLING * watched_h)
+            .collect();
+        let count = counted.len().max(1) as f64;
+        let mean_h = counted.iter().map(|(at_h, _)| at_h).sum::<f64>() / count;
+        let mean = counted.iter().map(|(_, value)| value).sum::<f64>() / count;
+        let (rise, run) = counted.iter().fold((0.0, 0.0), |(rise, run), (at_h, value)| {
+            let from_mean_h = at_h - mean_h;
+            (rise + from_mean_h * (value - mean), run + from_mean_h * from_mean_h)
+        });
+        Self {
+            first: counted.first().map_or(f64::NAN, |(_, value)| *value),
+            last: counted.last().map_or(f64::NAN, |(_, value)| *value),
+            per_h: if run > 0.0 { rise / run } else { 0.0 },
+        }
+    }
+}
+
+/// The run that is watched, and its viewers. Dropping it ends them.
+struct SoakRun {
+    caraware: PathBuf,
+    place: PathBuf,
+    directory: PathBuf,
+    child: Child,
+    viewers: Vec<Child>,
+    handovers: u32,
+}
+
+impl Drop for SoakRun {
+    fn drop(&mut self) {
+        for viewer in &mut self.viewers {
+            // A viewer that has ended cannot be killed.
+            let _ = viewer.kill();
+            let _ = viewer.wait();
+        }
+        if matches!(self.child.try_wait(), Ok(None)) {
+            signal(Pid::from_child(&self.child), Signal::TERM);
+            let _ = self.child.wait();
+        }
+    }
+}
+
+impl SoakRun {
+    fn start(options: &BenchOptions, place: &Path) -> Result<Self, Exit> {
+        let caraware = install::program(&options.bin, "caraware")?;
+        let watch = install::program(&options.bin, "fanout-watch")?;
+        let port = free_port()?;
+        let fanout = format!("fanout.listen=tcp/127.0.0.1:{port}");
+        let settings = SETTINGS.into_iter().chain([fanout.as_str()]);
+        let arguments = ["train", "town", "--name", NAME]
+            .into_iter()
+            .chain(settings.flat_map(|setting| ["--set", setting]));
+        let start = |program: &Path, arguments: &[&str]| {
+            let child = command(program, place).args(arguments).spawn();
+            child.map_err(|error| Exit::io("start", program, &error))
+        };
+        let mut run = Self {
+            child: start(&caraware, &arguments.collect::<Vec<_>>())?,
+            directory: place.join("runs").join(NAME),
+            place: place.to_owned(),
+            caraware,
+            viewers: Vec::new(),
+            handovers: 0,
+        };
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let seconds = (3600 + 60 * options.minutes).to_string();
+        for _ in 0..VIEWERS {
+            run.viewers
+                .push(start(&watch, &[&endpoint, NAME, "--seconds", &seconds])?);
+        }
+        Ok(run)
+    }
+
+    /// Waits for the first update: before it the trainer has not allocated what it needs.
+    fn wait_for_update(&mut self) -> Result<(), Exit> {
+        let begun = Instant::now();
+        let course = self.directory.join("learning.jsonl");
+        while fs::metadata(&course).map_or(0, |file| file.len()) == 0 {
+            self.check_alive()?;
+            if begun.elapsed() > DEADLINE {
+                return Err(Exit::run("the run has not learnt anything", "see its logs"));
+            }
+            std::thread::park_timeout(Duration::from_millis(100));
+        }
+        Ok(())
+    }
+
+    fn check_alive(&mut self) -> Result<(), Exit> {
+        match self.child.try_wait() {
+            Ok(None) => Ok(()),
+            Ok(Some(status)) => Err(Exit::run(format!("the run ended by itself with {status}"), "")),
+            Err(error) => Err(Exit::io("wait for", &self.caraware, &error)),
+        }
+    }
+
+    /// Private memory (MiB) and handles of all processes of a kind; `None` if there is none now.
+    fn resources(&self, target: Target) -> Option<(f64, f64)> {
+        let pids = match target {
+            Target::Supervisor => vec![Pid::from_child(&self.child)],
+            _ => target.processes(&self.directory),
+        };
+        pids.into_iter()
+            .filter_map(|pid| resources(pid, CountedMemory::Private))
+            .reduce(|sum, of_one| (sum.0 + of_one.0, sum.1 + of_one.1))
+    }
+
+    /// Replaces the trainer, after an update or at once in turn.
+    fn hand_over(&mut self) -> Result<(), Exit> {
+        let now = self.handovers % 2 == 1;
+        let status = command(&self.caraware, &self.place)
+            .args(["handover", NAME])
+            .args(now.then_some("--now"))
+            .status();
+        let status = status.map_err(|error| Exit::io("start", &self.caraware, &error))?;
+        if !status.success() {
+            return Err(Exit::run(format!("the handover ended with {status}"), ""));
+        }
+        self.handovers += 1;
+        Ok(())
+    }
+
+    /// Stops the run, and reads its report.
+    fn stop(mut self) -> Result<Value, Exit> {
+        let stopped = command(&self.caraware, &self.place).args(["stop", NAME]).status();
+        stopped.map_err(|error| Exit::io("start", &self.caraware, &error))?;
+        let status = self.child.wait();
+        status.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
+        let path = self.directory.join("report.json");
+        let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
+        serde_json::from_str(&text).map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))
+    }
+}
+
+/// A silent command whose runs and registry are in `place`.
+fn command(program: &Path, place: &Path) -> Command {
+    let mut command = Command::new(program);
+    command
+        .current_dir(place)
+        .env("CARAWARE_RUNTIME_DIR", place.join("r"))
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
+    command
+}
+
+/// Size of all files below a directory (MiB), without some of its entries.
+fn size_mib(directory: &Path, without: &[&str]) -> f64 {
+    let entries = fs::read_dir(directory).into_iter().flatten().flatten();
+    let counted = entries.filter(|entry| !without.iter().any(|name| entry.file_name() == *name));
+    counted
+        .map(|entry| match entry.metadata() {
+            Ok(metadata) if metadata.is_dir() => size_mib(&entry.path(), &[]),
+            Ok(metadata) => metadata.len() as f64 / f64::from(1 << 20),
+            // A log may be renamed meanwhile.
+            Err(_) => 0.0,
+        })
+        .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn growth_is_the_slope_after_the_filling() {
+        let values: Vec<(f64, f64)> = (0..=100)
+            .map(f64::from)
+            .map(|n| (n / 50.0, if n < 20.0 { 7.0 * n } else { 140.0 + 3.0 * n / 50.0 }))
+            .collect();
+        let growth = Growth::of(&values);
+        assert!((growth.per_h - 3.0).abs() < 1e-9, "{growth:?}");
+        assert!(
+            (growth.first - 141.2).abs() < 1e-9 && (growth.last - 146.0).abs() < 1e-9,
+            "{growth:?}"
+        );
+        assert_eq!(Growth::of(&[(0.0, 1.0)]).per_h, 0.0);
+    }
+}
