@@ -181,11 +181,14 @@ impl Run {
 
 /// The newest frames of one topic.
 pub fn watch(session: &zenoh::Session, key: String) -> Subscriber<RingChannelHandler<Sample>> {
-    session
+    let subscriber = session
         .declare_subscriber(key)
         .with(zenoh::handlers::RingChannel::new(64))
         .wait()
-        .unwrap()
+        .unwrap();
+    // The answer to a later question proves that the fan-out knows of the subscriber.
+    until("an answer with the map", || ask(session, "caraware/**/map").is_some());
+    subscriber
 }
 
 /// The next frame, as header and payload.
