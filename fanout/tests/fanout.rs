@@ -160,6 +160,24 @@ fn a_fast_producer_is_decimated_and_counted() {
     assert_eq!((health.state, health.ticks), (State::Done as u32, 5_002));
 }
 
+/// A run may pause at any tick: the newest one is published even if it came before the rate allowed it.
+#[test]
+fn the_newest_tick_is_published_if_none_follows() {
+    let run = Run::at_rate("paused", Mode::Simulate, 2.0);
+    let _fanout = run.start_fanout();
+    let viewer = run.attach();
+    let (sim, worlds) = publisher(&run, Channel::World);
+    let board = sim.board_of(Process::Fanout).unwrap();
+    until("attendance", || board.progress().attached == 1);
+    for tick in 0..5 {
+        send_world(&sim, &worlds, tick, 0, 2);
+        until("publication", || {
+            let frame = ask(&viewer, &run.key(Topic::World));
+            frame.is_some_and(|frame| fanout::frame::decode(&frame).unwrap().0.tick == tick)
+        });
+    }
+}
+
 /// Ticks of 2 000 road users at the rate of a paced run arrive complete and without gaps.
 #[test]
 fn two_thousand_road_users_arrive_without_a_gap() {

@@ -94,10 +94,11 @@ impl TickTopics {
         publisher: &mut EnvironmentPublisher,
         counters: &mut FanoutCounters,
     ) -> Result<(), FanoutError> {
-        // Every budget is asked: asking is what refills it.
+        // Every budget is asked: asking is what refills it. A channel without a tick to publish makes nothing due: the others' newest
+        // tick would be skipped, and in a paused run no other follows.
         let mut due = false;
         for stream in &mut self.streams {
-            due |= stream.budget.allows(now);
+            due |= stream.budget.allows(now) && stream.feed.fresh_ticks().next().is_some();
         }
         if !due {
             return Ok(());
