@@ -12,7 +12,7 @@ use crate::{
     cli::{ControlAction, ControlArgs, SwitchState},
     failure::Exit,
     registry,
-    socket::{self, ReplySocket, SupervisorRequest},
+    socket::{ReplySocket, SentRequest, SupervisorRequest},
 };
 
 /// Longest time that the supervisor waits for an answer. `traffic-bridge` takes commands between two SUMO steps, also while it waits
@@ -155,7 +155,7 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
             .to_json()
             .map_err(|error| Exit::run(format!("the command has no form in JSON: {error}"), ""))?,
     };
-    match socket::send_request(&run, &request)? {
+    match SentRequest::new(&run, &request)?.answer()? {
         Reply::Done(done) => {
             crate::say!("{}: tick {}: {}", run.name, done.tick, done.message);
             Ok(())

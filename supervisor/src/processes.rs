@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    path::{Path, PathBuf},
+    path::Path,
     process::{ChildStdout, ExitStatus},
 };
 
@@ -23,6 +23,7 @@ use crate::{
     failure::Exit,
     install::Install,
     running_process::{LeaveTime, RunningProcess},
+    socket::HandoverRequest,
     stall::{LifeSign, ProcessPlace},
 };
 
@@ -206,13 +207,13 @@ impl RunProcesses {
         &self,
         run: &RunFile,
         run_file: &Path,
-        checkpoint: Option<&PathBuf>,
+        request: &HandoverRequest,
     ) -> Result<(RunningProcess, Option<ChildStdout>), Exit> {
         let trainer = self.replaceable().map(|index| &self.running[index]);
         let trainer = trainer.ok_or_else(|| Exit::run("the run has no trainer", ""))?;
         let (row, incarnation) = (trainer.row, trainer.incarnation + 1);
         cores::within(self.cores_of(row, 0), || {
-            RunningProcess::start_successor(row, &self.install, run, run_file, incarnation, checkpoint)
+            RunningProcess::start_successor(row, &self.install, run, run_file, incarnation, request)
         })
     }
 

@@ -241,7 +241,7 @@ impl Drop for RunClaim {
     }
 }
 
-fn random_u64() -> Result<u64, Exit> {
+pub(crate) fn random_u64() -> Result<u64, Exit> {
     let path = Path::new("/dev/urandom");
     let mut bytes = [0_u8; 8];
     File::open(path)
@@ -358,6 +358,31 @@ pub fn sweep() -> usize {
     dead.len()
 }
 
+/// The run files of all runs that are alive, in a stable order.
+fn alive() -> Vec<RunFile> {
+    let alive = entries().into_iter().filter(|entry| entry.alive);
+    alive.filter_map(|entry| entry.run).collect()
+}
+
+/// The runs that are alive on this machine and whose trainers learn together with that of `run`, itself included.
+#[must_use]
+pub fn ranks_of(run: &RunFile) -> Vec<RunFile> {
+    let learns_with = |other: &RunFile| {
+        other.config.trainer.ranks == run.config.trainer.ranks
+            && other.run_dir.parent() == run.run_dir.parent()
+            && launch_of(&other.name) == launch_of(&run.name)
+    };
+    alive().into_iter().filter(learns_with).collect()
+}
+
+/// The name of rank 0's run: `caraware.parallel` calls those of the others NAME-rank1, NAME-rank2 …
+fn launch_of(name: &str) -> &str {
+    match name.rsplit_once("-rank") {
+        Some((launch, rank)) if !rank.is_empty() && rank.bytes().all(|byte| byte.is_ascii_digit()) => launch,
+        _ => name,
+    }
+}
+
 /// True if the supervisor of the run in `run_dir` lives.
 #[must_use]
 pub fn is_alive(run_dir: &Path) -> bool {
@@ -371,11 +396,7 @@ pub fn is_alive(run_dir: &Path) -> bool {
 /// # Errors
 /// No such run is alive, or several are.
 pub fn find(name: Option<&str>) -> Result<RunFile, Exit> {
-    let mut runs: Vec<RunFile> = entries()
-        .into_iter()
-        .filter(|entry| entry.alive)
-        .filter_map(|entry| entry.run)
-        .collect();
+    let mut runs = alive();
     let places: Vec<(&str, &Path)> = runs
         .iter()
         .map(|run| (run.name.as_str(), run.run_dir.as_path()))

@@ -17,7 +17,7 @@ use ipc_schema::{
 };
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
-use crate::{failure::Exit, install::Install};
+use crate::{failure::Exit, install::Install, socket::HandoverRequest};
 
 /// The command that starts the process of a row.
 ///
@@ -90,7 +90,7 @@ impl RunningProcess {
     }
 
     /// Starts a successor beside the working process of `row`. It reports on the returned standard output that it is ready, and waits
-    /// for [`RunningProcess::begin_work`]. With `checkpoint` it loads its parameters from there.
+    /// for [`RunningProcess::begin_work`]. `request` says from which checkpoint it loads its parameters, and where it meets other ranks.
     ///
     /// # Errors
     /// As [`RunningProcess::start`].
@@ -100,12 +100,13 @@ impl RunningProcess {
         run: &RunFile,
         run_file: &Path,
         incarnation: u32,
-        checkpoint: Option<&PathBuf>,
+        request: &HandoverRequest,
     ) -> Result<(Self, Option<ChildStdout>), Exit> {
         let mut successor = Self::spawn(row, install, run, run_file, incarnation, |command| {
             command
                 .env("CARAWARE_SUCCESSOR", "1")
-                .envs(checkpoint.map(|path| ("CARAWARE_CHECKPOINT", path)))
+                .envs(request.checkpoint.iter().map(|path| ("CARAWARE_CHECKPOINT", path)))
+                .envs(request.meeting.iter().map(|meeting| ("CARAWARE_MEETING", meeting)))
                 .stdin(Stdio::piped())
                 .stdout(Stdio::piped());
         })?;

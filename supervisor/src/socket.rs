@@ -2,7 +2,8 @@
 
 use std::{
     fs::Permissions,
-    io::{BufRead as _, BufReader, Read as _, Write as _},
+    io::{BufRead as _, BufReader, ErrorKind, Read as _, Write as _},
+    net::Shutdown,
     os::unix::{
         fs::PermissionsExt as _,
         net::{UnixListener, UnixStream},
@@ -54,6 +55,10 @@ pub struct HandoverRequest {
     /// Longest time to the old trainer's end, seconds; then the handover is refused.
     #[serde(default)]
     pub timeout_s: Option<f64>,
+    /// Where the successors of trainers that learn together meet. Each answers [`HandoverAnswer::Ready`] first, and its old trainer is not
+    /// asked to leave before the client permits it.
+    #[serde(default)]
+    pub meeting: Option<String>,
 }
 
 /// The supervisor's answer to a [`HandoverRequest`].
@@ -64,6 +69,8 @@ pub enum HandoverAnswer {
     Done(HandoverReport),
     /// Nothing has changed.
     Refused(Failure),
+    /// The successor is ready, and waits for those of the other ranks; another answer follows.
+    Ready,
 }
 
 /// A completed handover.
@@ -88,6 +95,17 @@ pub enum ReceivedRequest {
     Control(Command, Option<u32>, ReplySocket),
 }
 
+/// What the client says to [`HandoverAnswer::Ready`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Permission {
+    /// Nothing yet.
+    Awaited,
+    /// The old trainer may leave.
+    Given,
+    /// It has ended, or gives the handover up.
+    Withdrawn,
+}
+
 /// The connection over which a request is answered.
 #[derive(Debug)]
 pub struct ReplySocket(UnixStream);
@@ -95,9 +113,27 @@ pub struct ReplySocket(UnixStream);
 impl ReplySocket {
     /// Sends the answer; a connection that was closed meanwhile is only logged.
     pub fn answer(mut self, answer: &impl Serialize) {
+        self.announce(answer);
+    }
+
+    /// Sends an answer that another one follows.
+    pub fn announce(&mut self, answer: &impl Serialize) {
         let sent = serde_json::to_string(answer).map_err(std::io::Error::from);
         if let Err(error) = sent.and_then(|line| writeln!(self.0, "{line}")) {
             tracing::warn!(%error, "the connection was closed before the answer to its request");
+        }
+    }
+
+    /// Whether the client has permitted what it was announced; does not wait.
+    pub fn permission(&mut self) -> Permission {
+        let read = self.0.set_nonblocking(true).and_then(|()| self.0.read(&mut [0; 1]));
+        // The answer is written whole, however long that takes.
+        let reset = self.0.set_nonblocking(false);
+        match read.and_then(|read| reset.map(|()| read)) {
+            Ok(0) => Permission::Withdrawn,
+            Ok(_) => Permission::Given,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Permission::Awaited,
+            Err(_) => Permission::Withdrawn,
         }
     }
 
@@ -155,24 +191,60 @@ fn read_request(stream: UnixStream) -> std::io::Result<Option<ReceivedRequest>> 
     })
 }
 
-/// Sends a request to the supervisor of `run` and waits for its answer.
-///
-/// # Errors
-/// The run is over, or ends before it has answered.
-pub fn send_request<Answer: DeserializeOwned>(run: &RunFile, request: &SupervisorRequest) -> Result<Answer, Exit> {
-    let socket = run.control_socket();
-    let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", &socket, error);
-    let mut stream = UnixStream::connect(&socket).map_err(|error| failed(&error))?;
-    let text = serde_json::to_string(request).map_err(|error| failed(&error.into()))?;
-    writeln!(stream, "{text}").map_err(|error| failed(&error))?;
-    let mut line = String::new();
-    BufReader::new(stream)
-        .read_line(&mut line)
-        .map_err(|error| failed(&error))?;
-    serde_json::from_str(&line).map_err(|_| {
-        Exit::Failure(
-            Failure::new(FailureKind::Run, "the run ended before it answered")
-                .with_help("report.json in its directory shows how it ended"),
-        )
-    })
+/// A request that has been sent to the supervisor of a run. Dropping it withdraws what the client has not permitted.
+#[derive(Debug)]
+pub struct SentRequest {
+    stream: BufReader<UnixStream>,
+    socket: PathBuf,
+}
+
+impl SentRequest {
+    /// Sends a request to the supervisor of `run`.
+    ///
+    /// # Errors
+    /// The run is over.
+    pub fn new(run: &RunFile, request: &SupervisorRequest) -> Result<Self, Exit> {
+        let socket = run.control_socket();
+        let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", &socket, error);
+        let mut stream = UnixStream::connect(&socket).map_err(|error| failed(&error))?;
+        let text = serde_json::to_string(request).map_err(|error| failed(&error.into()))?;
+        writeln!(stream, "{text}").map_err(|error| failed(&error))?;
+        Ok(Self {
+            stream: BufReader::new(stream),
+            socket,
+        })
+    }
+
+    /// Waits for the next answer.
+    ///
+    /// # Errors
+    /// The run ends before it has answered.
+    pub fn answer<Answer: DeserializeOwned>(&mut self) -> Result<Answer, Exit> {
+        let mut line = String::new();
+        let read = self.stream.read_line(&mut line);
+        read.map_err(|error| Exit::io("ask the supervisor through", &self.socket, &error))?;
+        serde_json::from_str(&line).map_err(|_| {
+            Exit::Failure(
+                Failure::new(FailureKind::Run, "the run ended before it answered")
+                    .with_help("report.json in its directory shows how it ended"),
+            )
+        })
+    }
+
+    /// Withdraws what it has not permitted, and waits for the last answer.
+    pub fn withdraw(mut self) {
+        // A run that is over has nothing left to withdraw.
+        if self.stream.get_mut().shutdown(Shutdown::Write).is_ok() {
+            while matches!(self.answer(), Ok(HandoverAnswer::Ready)) {}
+        }
+    }
+
+    /// Permits what [`HandoverAnswer::Ready`] announced.
+    ///
+    /// # Errors
+    /// The run is over.
+    pub fn permit(&mut self) -> Result<(), Exit> {
+        let written = self.stream.get_mut().write_all(b"\n");
+        written.map_err(|error| Exit::io("ask the supervisor through", &self.socket, &error))
+    }
 }

@@ -220,10 +220,8 @@ impl Supervisor {
             }
             self.processes.forget_dead();
             self.note_memory_kill(index, &ended);
-            if ended.on_exit == OnExit::Replace
-                && self
-                    .handovers
-                    .trainer_ended(&mut self.processes, index, ended.is_done)?
+            if ended.row.on_exit == OnExit::Replace
+                && self.handovers.trainer_ended(&mut self.processes, index, &ended)?
             {
                 continue;
             }

@@ -17,7 +17,7 @@ use std::{
 
 use common::{Workplace, text, until};
 use ipc_schema::{
-    board::{Health, Progress},
+    board::{Health, Progress, State},
     ports::BoardReader,
     process::Process,
     run::RunFile,
@@ -565,6 +565,58 @@ fn learners_take_turns_and_every_tick_is_in_one_commit() {
     }
     assert!(commits.is_sorted_by(|a, b| a.1 < b.1), "{commits:?}");
     assert_nothing_left(&workplace, "turns");
+}
+
+/// Asks for a handover in the background, and waits until its successor is being started.
+fn ask_for_handover(workplace: &Workplace, run: &mut Run, name: &str) -> Child {
+    let mut command = workplace.command(&["handover", name]);
+    let client = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let successor = run.directory.join("run.next.json");
+    until(&mut run.child, "a successor", || successor.exists().then_some(()));
+    client
+}
+
+#[test]
+fn a_handover_waits_for_a_trainer_that_still_starts() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "early", &[PACED]);
+    let directory = run.directory.clone();
+    let pid = until(&mut run.child, "a trainer that starts", || trainer_pid(&directory));
+    kill_process(pid, Signal::STOP).unwrap();
+    assert_eq!(run.trainer.health().state, State::Starting as u32);
+    let client = ask_for_handover(&workplace, &mut run, "early");
+    // The successor gets ready long before the trainer that has been stopped.
+    let log = run.directory.join("logs/trainer.log");
+    until(&mut run.child, "a ready successor", || {
+        let log = std::fs::read_to_string(&log).ok()?;
+        log.contains("the successor is ready").then_some(())
+    });
+    kill_process(pid, Signal::CONT).unwrap();
+    let output = client.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(run.trainer.progress().incarnation, 1);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "early", 0);
+    assert_nothing_left(&workplace, "early");
+}
+
+#[test]
+fn a_successor_takes_over_from_a_trainer_that_is_killed_meanwhile() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "orphaned", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let client = ask_for_handover(&workplace, &mut run, "orphaned");
+    run.kill_trainer_at(0, 0);
+    let output = client.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(run.trainer.progress().incarnation, 1);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    // No trainer was started in the place of the one that was killed.
+    assert_undisturbed(&workplace, "orphaned", 0);
+    assert_eq!(workplace.report("orphaned")["handovers"].as_array().unwrap().len(), 1);
+    assert_nothing_left(&workplace, "orphaned");
 }
 
 /// A module that gets ready, takes over, and ends by `end`; it always ends so.

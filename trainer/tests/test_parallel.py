@@ -170,6 +170,72 @@ def test_a_killed_trainer_ends_all_ranks(tmp_path: Path, registry: Path) -> None
     assert not [line for _, line in command_lines() if str(tmp_path) in line]
 
 
+def ask(folder: Path, registry: Path, *words: str) -> subprocess.Popen[str]:
+    """`caraware` with these arguments, started and not waited for."""
+    return subprocess.Popen(
+        [caraware_program(), *words],
+        cwd=folder,
+        env=os.environ | {"CARAWARE_RUNTIME_DIR": str(registry), "CARAWARE_PYTHON": sys.executable},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def answer(asked: subprocess.Popen[str]) -> tuple[int, str]:
+    said, _ = asked.communicate(timeout=PATIENCE_S)
+    return asked.returncode, " ".join(said.replace("│", "").split())
+
+
+REFUSER = """
+import os, sys
+if "rank1" in sys.argv[1]:
+    sys.exit(5)
+os.write(1, b"ready\\n")
+os.read(0, 16)
+"""
+"""A trainer whose rank 1 does not get ready."""
+
+
+def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
+    tmp_path: Path, registry: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "refuser.py").write_text(REFUSER)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH")))))
+    names = ("handed", "handed-rank1")
+    whole = two_ranks(tmp_path, registry, "whole")
+    said, _ = whole.communicate(timeout=PATIENCE_S)
+    assert whole.returncode == 0, said
+
+    handed = two_ranks(tmp_path, registry, "handed", "trainer.checkpoint_interval=1", "run.real_time_factor=8")
+    wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
+    # A paused run makes no update, after which its trainer could leave.
+    for name in names:
+        code, said = answer(ask(tmp_path, registry, "control", "pause", "--run", name))
+        assert code == 0, said
+    code, said = answer(ask(tmp_path, registry, "handover", "handed", "--now"))
+    assert code == 2 and "leave together, after an update" in said, said
+    # The successor of rank 0 is ready, that of rank 1 ends: both old trainers continue.
+    code, said = answer(ask(tmp_path, registry, "handover", "handed", "--set=trainer.module=refuser"))
+    assert code == 1 and "the old trainer continues" in said, said
+    handover = ask(tmp_path, registry, "handover", "handed-rank1")
+    logs = [tmp_path / name / "logs" / "trainer.log" for name in names]
+    wait_until(lambda: all("the successor is ready" in log.read_text() for log in logs), handed)
+    for name in names:
+        code, said = answer(ask(tmp_path, registry, "control", "resume", "--run", name))
+        assert code == 0, said
+    code, said = answer(handover)
+    assert code == 0 and all(f"{name}: trainer 1 continues" in said for name in names), said
+    said, _ = handed.communicate(timeout=PATIENCE_S)
+    assert handed.returncode == 0, said
+    for name, undisturbed in zip(names, ("whole", "whole-rank1"), strict=True):
+        assert tensors(tmp_path / name) == tensors(tmp_path / undisturbed)
+        written, expected = report(tmp_path / name), report(tmp_path / undisturbed)
+        assert (len(written["handovers"]), written["restarts"]) == (1, 0)
+        assert written["observation_hash"] == expected["observation_hash"]
+        assert (written["lost_ticks"], written["duplicated_ticks"]) == (0, 0)
+
+
 def command_lines() -> list[tuple[int, str]]:
     """Process ids and command lines of all processes."""
     lines = []

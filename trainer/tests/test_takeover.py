@@ -53,12 +53,12 @@ def _learner(run: subprocess.Popen[str]) -> psutil.Process | None:
 
 
 def _hand_over(place: str, environment: dict[str, str]) -> bool:
-    """Hand the run over to the module; False while its trainer is still starting. No checkpoint may exist before."""
+    """Hand the run over to the module; False while there is no run. No checkpoint may exist before."""
     assert not list(Path(place, "runs", "taken").glob("checkpoints/update-*"))
     command: list[str | Path] = [CARAWARE, "handover", "taken", "--set", f"trainer.module={MODULE}"]
     ran = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=120)
     said = ran.stdout + ran.stderr
-    if "still starting" in said or "no run" in said:
+    if "no run" in said:
         return False
     assert ran.returncode == 0, said
     return True

@@ -6,6 +6,7 @@ pub mod request;
 
 use std::{
     io::{BufRead as _, BufReader},
+    os::unix::process::ExitStatusExt as _,
     path::PathBuf,
     sync::mpsc::{Receiver, channel},
 };
@@ -14,7 +15,7 @@ use ipc_schema::{
     board::State,
     config::Config,
     failure::{Failure, FailureKind},
-    process::Process,
+    process::{OnExit, Process},
     run::RunFile,
 };
 
@@ -68,7 +69,7 @@ impl Handovers {
         reply: ReplySocket,
         report_ready: impl FnOnce(u32) -> bool + Send + 'static,
     ) {
-        if let Some(message) = self.obstacle(processes) {
+        if let Some(message) = self.obstacle(processes, &request) {
             let failure = Failure::new(FailureKind::Run, message).with_help("`caraware ps` shows the state of the run");
             return reply.answer(&HandoverAnswer::Refused(failure));
         }
@@ -86,21 +87,22 @@ impl Handovers {
     }
 
     /// The reason why no handover can begin now, if there is one.
-    fn obstacle(&self, processes: &RunProcesses) -> Option<&'static str> {
+    fn obstacle(&self, processes: &RunProcesses, request: &HandoverRequest) -> Option<&'static str> {
         let learns_alone = processes.run().config.trainer.ranks == 1;
         match processes.state_of(Process::Trainer) {
             _ if self.current.is_some() => Some("another handover is in progress"),
-            _ if !learns_alone => {
+            _ if !learns_alone && request.meeting.is_none() => {
                 Some("the trainer learns together with other ranks, and one rank cannot be replaced alone")
             }
             _ if processes.replaceable().is_none() => Some("the run has no trainer"),
-            State::Starting => Some("the trainer is still starting"),
             State::Done => Some("the trainer is done"),
-            State::Ready | State::Running => None,
+            // A trainer that starts is asked once it is ready.
+            State::Starting | State::Ready | State::Running => None,
         }
     }
 
-    /// Asks the old trainer to leave, because the successor of this incarnation is ready; refuses one that does not fit the run.
+    /// Lets the successor of this incarnation, which is ready, take over as soon as the old trainer has left; refuses one that does not
+    /// fit the run.
     pub fn successor_ready(&mut self, processes: &mut RunProcesses, incarnation: u32) {
         let Some(handover) = self.current.take() else {
             return;
@@ -110,30 +112,46 @@ impl Handovers {
             let help = "start it with settings that fit the run, or start another run for it";
             return handover.refuse(Failure::new(FailureKind::Run, message).with_help(help));
         }
-        let (handover, leave) = handover.successor_ready(incarnation);
-        let when = handover.leave_time();
-        self.current = Some(handover);
-        if leave && let Some(index) = processes.replaceable() {
+        self.current = Some(handover.successor_ready(incarnation));
+        self.ask_trainer_to_leave(processes);
+    }
+
+    /// Asks the old trainer to leave, if a ready successor waits for that and the trainer can be asked.
+    fn ask_trainer_to_leave(&mut self, processes: &mut RunProcesses) {
+        let can_be_asked = matches!(processes.state_of(Process::Trainer), State::Ready | State::Running);
+        if let Some(handover) = self.current.take_if(|handover| handover.may_ask() && can_be_asked)
+            && let Some(index) = processes.replaceable()
+        {
             processes.set_handing_over(true);
-            processes.ask_to_leave(index, when);
+            processes.ask_to_leave(index, handover.leave_time());
             self.is_trainer_leaving = true;
+            self.current = Some(handover.trainer_asked());
         }
     }
 
-    /// Handles the end of the trainer: makes the waiting successor the trainer and returns true. Returns false if none waits.
+    /// Handles the end of the trainer: makes a ready successor the trainer. Returns true if a successor takes over, also one that is
+    /// still getting ready; until then the trainer is not started again.
     ///
     /// # Errors
     /// iceoryx2 refuses, or the run file cannot be written.
-    pub fn trainer_ended(&mut self, processes: &mut RunProcesses, index: usize, is_done: bool) -> Result<bool, Exit> {
+    pub fn trainer_ended(
+        &mut self,
+        processes: &mut RunProcesses,
+        index: usize,
+        ended: &EndedProcess,
+    ) -> Result<bool, Exit> {
         let Some(handover) = self.current.take() else {
             return Ok(false);
         };
-        if handover.is_opening() && !is_done {
+        if handover.is_opening() && !ended.is_done {
             // It is the successor that has ended: it, or the learner before it, is started again.
             self.current = Some(handover);
             return Ok(false);
         }
-        if is_done || !handover.is_leaving() {
+        // The other ranks are in the middle of a step that a killed one has left.
+        let was_killed = ended.status.signal().is_some() && ended.on_exit == OnExit::Replace;
+        let may_follow = was_killed || self.is_trainer_leaving;
+        if ended.is_done || !may_follow {
             self.current = Some(handover);
             self.refuse_current(
                 processes,
@@ -142,11 +160,16 @@ impl Handovers {
             );
             return Ok(false);
         }
+        if handover.is_getting_ready() {
+            self.current = Some(handover);
+            return Ok(true);
+        }
         let (handover, left) = handover.old_trainer_left();
         self.current = Some(handover);
         let Some((successor, run)) = left else {
             return Ok(false);
         };
+        processes.set_handing_over(true);
         processes.set_incarnation(successor.row, 0, successor.incarnation)?;
         processes.wake_sensing();
         write_run(&run, "run.json")?;
@@ -236,6 +259,7 @@ impl Handovers {
             self.completed.extend(handover.complete(progress.committed_ticks));
         } else {
             self.current = Some(handover);
+            self.ask_trainer_to_leave(processes);
         }
     }
 
@@ -294,7 +318,7 @@ fn start_successor(
         ..processes.run().clone()
     };
     let run_file = write_run(&run, phases::SUCCESSOR_RUN_FILE)?;
-    let (successor, output) = processes.start_successor(&run, &run_file, request.checkpoint.as_ref())?;
+    let (successor, output) = processes.start_successor(&run, &run_file, request)?;
     let incarnation = successor.incarnation;
     let (sender, ready_line) = channel();
     let wait = move || {

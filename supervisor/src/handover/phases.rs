@@ -16,7 +16,7 @@ use crate::{
     failure::Exit,
     handover::claims::SuccessorClaims,
     running_process::{LeaveTime, RunningProcess},
-    socket::{HandoverAnswer, HandoverReport, HandoverRequest, ReplySocket},
+    socket::{HandoverAnswer, HandoverReport, HandoverRequest, Permission, ReplySocket},
 };
 
 /// Longest time from the start of a successor to its readiness.
@@ -27,8 +27,10 @@ const SUCCESSOR: &str = "successor";
 /// Progress of a handover.
 #[derive(Debug)]
 enum HandoverPhase {
-    /// The successor prepares; the old trainer works.
+    /// The successor prepares; the old trainer works, or has been killed meanwhile.
     GettingReady { successor: RunningProcess },
+    /// The successor is ready; the old trainer still starts, or the successors of other ranks are not ready.
+    Waiting { successor: RunningProcess },
     /// The supervisor has asked the old trainer to leave.
     Leaving { successor: RunningProcess },
     /// The successor is the trainer, and opens its ports.
@@ -47,6 +49,8 @@ pub struct HandoverInProgress {
     /// The line with which the successor says that it is ready.
     ready_line: Receiver<String>,
     since: Instant,
+    /// The old trainer may be asked to leave.
+    is_permitted: bool,
     phase: HandoverPhase,
 }
 
@@ -62,6 +66,7 @@ impl HandoverInProgress {
         ready_line: Receiver<String>,
     ) -> Self {
         Self {
+            is_permitted: request.meeting.is_none(),
             request,
             reply,
             run,
@@ -91,16 +96,29 @@ impl HandoverInProgress {
         }
     }
 
-    /// Notes that the successor is ready. True if the old trainer must leave now.
+    /// Notes that the successor is ready.
     #[must_use]
-    pub fn successor_ready(self, incarnation: u32) -> (Self, bool) {
-        match self.phase {
+    pub fn successor_ready(mut self, incarnation: u32) -> Self {
+        let phase = match self.phase {
             HandoverPhase::GettingReady { successor } if successor.incarnation == incarnation => {
-                let phase = HandoverPhase::Leaving { successor };
-                (Self { phase, ..self }, true)
+                if !self.is_permitted {
+                    self.reply.announce(&HandoverAnswer::Ready);
+                }
+                HandoverPhase::Waiting { successor }
             }
-            phase => (Self { phase, ..self }, false),
-        }
+            phase => phase,
+        };
+        Self { phase, ..self }
+    }
+
+    /// Notes that the old trainer has been asked to leave.
+    #[must_use]
+    pub fn trainer_asked(self) -> Self {
+        let phase = match self.phase {
+            HandoverPhase::Waiting { successor } => HandoverPhase::Leaving { successor },
+            phase => phase,
+        };
+        Self { phase, ..self }
     }
 
     /// The reason of a failed handover: the successor ended, or it was not ready or the old trainer had not left in time.
@@ -112,6 +130,10 @@ impl HandoverInProgress {
                 Some(asked.unwrap_or(READY_WITHIN)),
                 "the successor was not ready",
             ),
+            // A trainer that does not get ready is killed, and the successor takes over.
+            HandoverPhase::Waiting { successor } => (successor, asked, "the old trainer was not ready"),
+            // Ranks leave together: one that gave up alone would end the others' steps.
+            HandoverPhase::Leaving { successor } if self.request.meeting.is_some() => (successor, None, ""),
             HandoverPhase::Leaving { successor } => (successor, asked, "the old trainer had not left"),
             HandoverPhase::Opening { .. } => return None,
         };
@@ -124,6 +146,16 @@ impl HandoverInProgress {
             );
             return Some(failure);
         }
+        if !self.is_permitted {
+            match self.reply.permission() {
+                Permission::Awaited => {}
+                Permission::Given => self.is_permitted = true,
+                Permission::Withdrawn => {
+                    let message = "the handover was withdrawn: the old trainer continues";
+                    return Some(Failure::new(FailureKind::Run, message));
+                }
+            }
+        }
         limit.filter(|limit| self.since.elapsed() > *limit).map(|limit| {
             let message = format!("{what} within {} s: the old trainer continues", limit.as_secs_f64());
             Failure::new(FailureKind::Run, message).with_help(
@@ -132,17 +164,24 @@ impl HandoverInProgress {
         })
     }
 
-    /// True while the old trainer is expected to end.
+    /// True while the successor prepares.
     #[must_use]
-    pub fn is_leaving(&self) -> bool {
-        matches!(self.phase, HandoverPhase::Leaving { .. })
+    pub fn is_getting_ready(&self) -> bool {
+        matches!(self.phase, HandoverPhase::GettingReady { .. })
     }
 
-    /// The old trainer has left: returns the successor, which has not started its work, and the run as it is from now on.
+    /// True while the old trainer of a ready successor may be asked to leave.
+    #[must_use]
+    pub fn may_ask(&self) -> bool {
+        matches!(self.phase, HandoverPhase::Waiting { .. }) && self.is_permitted
+    }
+
+    /// The old trainer has left or was killed: returns the ready successor, which has not started its work, and the run as it is from now
+    /// on.
     #[must_use]
     pub fn old_trainer_left(self) -> (Self, Option<(RunningProcess, RunFile)>) {
         match self.phase {
-            HandoverPhase::Leaving { successor } => {
+            HandoverPhase::Waiting { successor } | HandoverPhase::Leaving { successor } => {
                 let phase = HandoverPhase::Opening {
                     left: Instant::now(),
                     incarnation: successor.incarnation,

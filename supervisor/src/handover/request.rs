@@ -12,7 +12,7 @@ use crate::{
     config::{self, LayeredSettings},
     failure::Exit,
     registry,
-    socket::{self, HandoverAnswer, HandoverRequest, SupervisorRequest},
+    socket::{HandoverAnswer, HandoverRequest, SentRequest, SupervisorRequest},
 };
 
 /// The only settings that may change in a live run.
@@ -58,7 +58,12 @@ fn timeout_s(seconds: f64) -> Result<f64, Exit> {
     ))
 }
 
-/// Asks the supervisor of a run to replace its trainer, and waits for the answer.
+/// A name that no other handover has.
+fn meeting() -> Result<String, Exit> {
+    Ok(format!("handover-{:016x}", registry::random_u64()?))
+}
+
+/// Asks the supervisor of a run to replace its trainer, and waits for the answer. Trainers that learn together are replaced together.
 ///
 /// # Errors
 /// The request is wrong or refused, or no such run is alive.
@@ -76,8 +81,34 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
         checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
         now: args.now,
         timeout_s: args.timeout_s.map(timeout_s).transpose()?,
+        meeting: (run.config.trainer.ranks > 1).then(meeting).transpose()?,
     };
-    match socket::send_request(&run, &SupervisorRequest::Handover(request))? {
+    let runs = ranks(&run, args.now)?;
+    let requests = runs
+        .iter()
+        .map(|run| SentRequest::new(run, &SupervisorRequest::Handover(request.clone())));
+    let mut requests: Vec<SentRequest> = requests.collect::<Result<_, _>>()?;
+    if request.meeting.is_some() {
+        // No old trainer leaves before all successors are ready: they leave after the same update.
+        let refused = requests.iter_mut().find_map(|sent| match sent.answer() {
+            Ok(HandoverAnswer::Refused(failure)) => Some(failure.into()),
+            Ok(_) => None,
+            Err(error) => Some(error),
+        });
+        if let Some(refused) = refused {
+            requests.into_iter().for_each(SentRequest::withdraw);
+            return Err(refused);
+        }
+        requests.iter_mut().try_for_each(SentRequest::permit)?;
+    }
+    for (run, sent) in runs.iter().zip(&mut requests) {
+        print_answer(run, sent.answer()?)?;
+    }
+    Ok(())
+}
+
+fn print_answer(run: &RunFile, answer: HandoverAnswer) -> Result<(), Exit> {
+    match answer {
         HandoverAnswer::Done(report) => {
             crate::say!(
                 "{}: trainer {} continues from tick {}; the handover took {:.2} s",
@@ -89,7 +120,40 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
             Ok(())
         }
         HandoverAnswer::Refused(failure) => Err(failure.into()),
+        HandoverAnswer::Ready => Err(Exit::run(
+            format!("{} said twice that its successor is ready", run.name),
+            "its supervisor is of another version; stop the run and resume it",
+        )),
     }
+}
+
+/// The runs whose trainers are replaced together: `run` alone, or those of all ranks.
+fn ranks(run: &RunFile, now: bool) -> Result<Vec<RunFile>, Exit> {
+    let ranks = run.config.trainer.ranks;
+    if ranks == 1 {
+        return Ok(vec![run.clone()]);
+    }
+    if now {
+        return Err(Exit::config(
+            format!(
+                "the {ranks} ranks that learn with {} cannot leave at any tick",
+                run.name
+            ),
+            "they leave together, after an update: leave out `--now`",
+        ));
+    }
+    let runs = registry::ranks_of(run);
+    if runs.len() != ranks as usize {
+        return Err(Exit::config(
+            format!(
+                "{} of the {ranks} ranks that learn with {} are on this machine",
+                runs.len(),
+                run.name
+            ),
+            "a handover replaces the trainers of all ranks, on one machine; Ctrl-C and `--resume` do so on several",
+        ));
+    }
+    Ok(runs)
 }
 
 /// Refuses the former name of the command.

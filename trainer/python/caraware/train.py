@@ -32,13 +32,10 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     from caraware.ipc.channel import Channel
     from caraware.learn import ranks
 
-    together = ranks.of_run(config.trainer.ranks)
-    if role.replaces:
-        learner = _successor(run_file, config, role)
-        if role.gets_ready:
-            return
-    else:
-        learner = _resumed(config, together)
+    if role.gets_ready and not _get_ready(run_file, config, role):
+        return
+    together = ranks.of_run(config.trainer.ranks, role.meeting)
+    learner = _successor(run_file, config, role, together) if role.replaces else _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     if learner is not None:
         positions = enumerate(position.committed() for position in learner.positions())
@@ -85,8 +82,30 @@ def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
     return learner
 
 
-def _successor(run_file: Path, config: "RunConfig", role: HandoverRole) -> "Learner | None":
-    """A learner continued from the run's newest sound checkpoint; None if the supervisor cancels the handover."""
+def _get_ready(run_file: Path, config: "RunConfig", role: HandoverRole) -> bool:
+    """Find errors in the settings or the checkpoint while the predecessor learns; False if the handover is cancelled."""
+    from caraware import _native
+    from caraware.learn.stored import PPO
+    from caraware.run.continuation import Continuation
+    from caraware.run.learner import Learner
+
+    size = _native.observation_size(str(run_file))
+    found = Continuation.find(config.run_dir / "checkpoints", config.commits, PPO)
+    Learner.begin(replace(config, resume_from=role.checkpoint or found.checkpoint), size).warm_up()
+    claims = SuccessorClaims(
+        schema_version=_native.SCHEMA_VERSION,
+        observation_size=size,
+        task=config.task.name,
+        action_size=config.task.actions.size,
+        environments=len(config.environments),
+        decides_lessons=True,
+        first_tick=found.first_tick(),
+    )
+    return role.wait_for_turn(claims)
+
+
+def _successor(run_file: Path, config: "RunConfig", role: HandoverRole, ranks: "Ranks") -> "Learner":
+    """A learner continued from the run's newest sound checkpoint."""
     from caraware import _native
     from caraware.learn.stored import PPO
     from caraware.run.checkpoint import remove_partial
@@ -94,27 +113,12 @@ def _successor(run_file: Path, config: "RunConfig", role: HandoverRole) -> "Lear
     from caraware.run.learner import Learner
 
     size, folder = _native.observation_size(str(run_file)), config.run_dir / "checkpoints"
-    if role.gets_ready:
-        # Errors in the settings or the checkpoint show here, while the predecessor is still learning.
-        found = Continuation.find(folder, config.commits, PPO)
-        Learner.begin(replace(config, resume_from=role.checkpoint or found.checkpoint), size).warm_up()
-        claims = SuccessorClaims(
-            schema_version=_native.SCHEMA_VERSION,
-            observation_size=size,
-            task=config.task.name,
-            action_size=config.task.actions.size,
-            environments=len(config.environments),
-            decides_lessons=True,
-            first_tick=found.first_tick(),
-        )
-        if not role.wait_for_turn(claims):
-            return None
     remove_partial(folder)
     remove_uncommitted(folder, config.commits, PPO)
     found = Continuation.find(folder, config.commits, PPO)
     # Before the first checkpoint of the run it is the one that the run begins with.
     beginning = None if found.others else config.resume_from
-    learner = Learner.begin(replace(config, resume_from=found.checkpoint or beginning), size)
+    learner = Learner.begin(replace(config, resume_from=found.checkpoint or beginning), size, ranks)
     learner.follow(found)
     name = found.checkpoint.name if found.checkpoint else "the beginning"
     log.info("continues from %s at tick %d", name, learner.first_tick())

@@ -25,6 +25,8 @@ from torch import Tensor
 
 WAIT_AT_MOST = timedelta(hours=1)
 """For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
+MEET_WITHIN = timedelta(minutes=5)
+"""For successors, all of which are ready."""
 
 
 SECRET = "CARAWARE_RANKS_SECRET"
@@ -113,6 +115,10 @@ class Ranks:
         """The least verdict and episode of all ranks. Waits for all of them."""
         return verdict, episode
 
+    def all(self, value: bool) -> bool:
+        """Whether it is true on all ranks."""
+        return value
+
     def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> SampleUnion:
         """The samples of all, `[s]` (of the advantage `[s]` or `[s, k]`) of this rank given."""
         return SampleUnion(advantage, reward, value_target, 0, len(advantage))
@@ -163,7 +169,7 @@ def shared_secret(environment: Mapping[str, str]) -> bytes:
 class TorchRanks(Ranks):
     """A trainer among others that `torchrun` started (`caraware.parallel`)."""
 
-    def __init__(self, ranks: int) -> None:
+    def __init__(self, ranks: int, meeting: str | None = None) -> None:
         """Meet the others. Raises `RankError` if they do not come, or are not `ranks`."""
         import torch.distributed as dist
 
@@ -178,10 +184,20 @@ class TorchRanks(Ranks):
         with self._together("meeting"):
             nccl = torch.cuda.is_available() and not self._is_shared
             backend = "cpu:gloo,cuda:nccl" if nccl else "gloo"
-            dist.init_process_group(backend, timeout=WAIT_AT_MOST)
+            if meeting is None:
+                dist.init_process_group(backend, timeout=WAIT_AT_MOST)
+            else:
+                place = {"rank": int(os.environ["RANK"]), "world_size": ranks}
+                dist.init_process_group(backend, timeout=WAIT_AT_MOST, store=self._store(meeting), **place)
             self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
         self._authenticate(shared_secret(os.environ))
+
+    def _store(self, meeting: str) -> Any:
+        """A part of the store that `torchrun` keeps: in the whole, the addresses of those who left are still there."""
+        address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        whole = self._dist.TCPStore(address, port, is_master=False, timeout=MEET_WITHIN)
+        return self._dist.PrefixStore(meeting, whole)
 
     def _authenticate(self, secret: bytes) -> None:
         """Each rank proves to each other that it knows the secret. Raises `RankError` if one does not."""
@@ -211,6 +227,13 @@ class TorchRanks(Ranks):
         with self._together("waiting for all horizons"):
             self._dist.all_reduce(values, op=self._dist.ReduceOp.MIN)
         return Verdict(int(values[0])), int(values[1])
+
+    def all(self, value: bool) -> bool:
+        """See `Ranks.all`."""
+        own = torch.tensor([int(value)])
+        with self._together("asking all"):
+            self._dist.all_reduce(own, op=self._dist.ReduceOp.MIN)
+        return bool(own[0])
 
     def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> SampleUnion:
         """See `Ranks.union`."""
@@ -280,6 +303,9 @@ class TorchRanks(Ranks):
         self._dist.destroy_process_group()
 
 
-def of_run(ranks: int) -> Ranks:
-    """Alone, or among the others that `torchrun` started. Raises `RankError`."""
-    return TorchRanks(ranks) if ranks > 1 else Ranks()
+def of_run(ranks: int, meeting: str | None = None) -> Ranks:
+    """Alone, or among the others that `torchrun` started. Raises `RankError`.
+
+    Successors that meet while a launch lasts name a `meeting`, where those before them have not met.
+    """
+    return TorchRanks(ranks, meeting) if ranks > 1 else Ranks()

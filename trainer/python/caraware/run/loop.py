@@ -87,7 +87,7 @@ class TrainingLoop:
         """
         while not (self._left or self._ended() or self._stopped()):
             self._receive()
-            if self._leave_now_requested() or (self._idle_waits > 1 and self._leave_requested()):
+            if self._leave_now_requested() or (self._idle_waits > 1 and self._may_leave_alone()):
                 self._left = True
                 break
             self._consume()
@@ -195,7 +195,7 @@ class TrainingLoop:
                 self._lesson_end = obs
                 break
             # A successor can continue amid an evaluation, or after an update.
-            if obs.evaluation and self._leave_requested():
+            if obs.evaluation and self._may_leave_alone():
                 self._left = True
                 break
         if processed % CREDIT_TICKS:
@@ -242,7 +242,7 @@ class TrainingLoop:
         if all(full):
             if self._agree(Verdict.FULL):
                 self._learn(learner)
-                self._left = self._leave_requested()
+                self._left = self._ranks.all(self._leave_requested())
         elif any(environment.ended and not full[environment.index] for environment in self._environments):
             self._agree(Verdict.ENDED)
 
@@ -310,6 +310,10 @@ class TrainingLoop:
         self._learns = agreed is Verdict.FULL
         self._others_stopped = agreed is Verdict.STOP
         return self._learns
+
+    def _may_leave_alone(self) -> bool:
+        """Whether a successor waits, and no other trainer has to leave at the same update."""
+        return self._ranks.size == 1 and self._leave_requested()
 
     def _stopped(self) -> bool:
         """Whether this trainer, or one that learns together with it, has been asked to stop."""

@@ -86,6 +86,8 @@ class HandoverRole:
     """The other trainer is still running: get ready, then wait for the handover."""
     checkpoint: Path | None
     """Parameters to take instead of the newest of the run."""
+    meeting: str | None = None
+    """Where it meets the successors of the trainers that learn together; None if it learns alone."""
 
     @classmethod
     def from_environment(cls) -> "HandoverRole":
@@ -95,6 +97,7 @@ class HandoverRole:
             replaces=int(os.environ.get("CARAWARE_INCARNATION", "0")) > 0,
             gets_ready=bool(os.environ.get("CARAWARE_SUCCESSOR")),
             checkpoint=Path(checkpoint) if checkpoint else None,
+            meeting=os.environ.get("CARAWARE_MEETING"),
         )
 
     def wait_for_turn(self, claims: SuccessorClaims | None = None) -> bool:
@@ -104,6 +107,7 @@ class HandoverRole:
         """
         os.write(1, (claims or SuccessorClaims()).line())
         os.dup2(2, 1)
+        log.info("the successor is ready, and waits for its turn")
         if os.read(0, 16) != b"go\n":
             return False
         self.gets_ready = False
