@@ -83,7 +83,7 @@ def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
 
 
 def _get_ready(run_file: Path, config: "RunConfig", role: HandoverRole) -> bool:
-    """Find errors in the settings or the checkpoint while the predecessor learns; False if the handover is cancelled."""
+    """Find errors in settings or checkpoint while the predecessor learns; False if the handover is cancelled."""
     from caraware import _native
     from caraware.learn.stored import PPO
     from caraware.run.continuation import Continuation
