@@ -187,17 +187,18 @@ class TorchRanks(Ranks):
             if meeting is None:
                 dist.init_process_group(backend, timeout=WAIT_AT_MOST)
             else:
-                place = {"rank": int(os.environ["RANK"]), "world_size": ranks}
-                dist.init_process_group(backend, timeout=WAIT_AT_MOST, store=self._store(meeting), **place)
+                rank, store = int(os.environ["RANK"]), self._store(meeting)
+                dist.init_process_group(backend, timeout=WAIT_AT_MOST, world_size=ranks, rank=rank, store=store)
             self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
         self._authenticate(shared_secret(os.environ))
 
     def _store(self, meeting: str) -> Any:
         """A part of the store that `torchrun` keeps: in the whole, the addresses of those who left are still there."""
+        from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]  # see `caraware.parallel`
+
         address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-        whole = self._dist.TCPStore(address, port, is_master=False, timeout=MEET_WITHIN)
-        return self._dist.PrefixStore(meeting, whole)
+        return PrefixStore(meeting, TCPStore(address, port, is_master=False, timeout=MEET_WITHIN))
 
     def _authenticate(self, secret: bytes) -> None:
         """Each rank proves to each other that it knows the secret. Raises `RankError` if one does not."""
