@@ -136,13 +136,19 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
     }
 }
 
-/// A port of this machine that no process uses.
+/// Ports below Linux's ephemeral ones (32768 to 60999), which outgoing connections of other programs may take while a run starts again.
+const PORTS: std::ops::Range<u16> = 20_000..30_000;
+
+/// A port of this machine that no process uses, and that another benchmark beside this one hardly draws.
 ///
 /// # Errors
 /// There is none.
 fn free_port() -> Result<u16, Exit> {
-    std::net::TcpListener::bind("127.0.0.1:0")
-        .and_then(|listener| listener.local_addr())
-        .map(|address| address.port())
-        .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
+    let first = fastrand::u16(PORTS);
+    let ports = (first..PORTS.end).chain(PORTS.start..first);
+    let is_free = |port: &u16| std::net::TcpListener::bind(("127.0.0.1", *port)).is_ok();
+    ports
+        .into_iter()
+        .find(is_free)
+        .ok_or_else(|| Exit::run(format!("no port of {PORTS:?} is free"), ""))
 }
