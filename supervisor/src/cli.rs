@@ -156,7 +156,8 @@ const HANDOVER: &str = "Examples:
   caraware handover --now --timeout-s 30                 do not wait for the next update
 
 The successor starts beside the old trainer. Once it is ready, the old trainer writes a checkpoint and leaves. If the successor
-fails, the handover is refused and the old trainer continues; if it fails before its first commit, the one before it returns.";
+fails, the handover is refused and the old trainer continues; if it fails before its first commit, the one before it returns.
+Trainers that learn together are replaced together, after an update; --now is refused for them (docs/parallel.md).";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning

@@ -124,7 +124,7 @@ impl ReplySocket {
         }
     }
 
-    /// Whether the client has permitted what it was announced; does not wait.
+    /// What the client has said to an announcement; does not wait.
     pub fn permission(&mut self) -> Permission {
         let read = self.0.set_nonblocking(true).and_then(|()| self.0.read(&mut [0; 1]));
         // The answer is written whole, however long that takes.

@@ -207,7 +207,7 @@ def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     said, _ = whole.communicate(timeout=PATIENCE_S)
     assert whole.returncode == 0, said
 
-    handed = two_ranks(tmp_path, registry, "handed", "trainer.checkpoint_interval=1", "run.real_time_factor=8")
+    handed = two_ranks(tmp_path, registry, "handed", "trainer.checkpoint_interval=1", "run.real_time_factor=2")
     wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
     # A paused run makes no update, after which its trainer could leave.
     for name in names:

@@ -194,7 +194,7 @@ class TorchRanks(Ranks):
         self._authenticate(shared_secret(os.environ))
 
     def _store(self, meeting: str) -> Any:
-        """A part of the store that `torchrun` keeps: in the whole, the addresses of those who left are still there."""
+        """A part of the store that `torchrun` keeps: the addresses of the old trainers are still in the whole."""
         from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]  # see `caraware.parallel`
 
         address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
