@@ -10,7 +10,7 @@ use std::{
     os::{fd::OwnedFd, unix::fs::DirBuilderExt as _},
     path::{Path, PathBuf},
     process::{Child, Command, Output},
-    sync::{Mutex, MutexGuard, PoisonError},
+    sync::{Condvar, Mutex, PoisonError},
     time::{Duration, Instant, SystemTime},
 };
 
@@ -37,8 +37,31 @@ pub const BARE_NET_SETTINGS: [&str; 6] = [
     "fanout.enabled=false",
 ];
 
-/// Whole runs use all cores and check shared memory, so one test runs at a time.
-static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+/// How many tests of a file have a workplace. A whole run has several processes, which wait for each other much of the time.
+static TAKEN: Mutex<usize> = Mutex::new(0);
+static RETURNED: Condvar = Condvar::new();
+
+/// A test's share of the machine: as many tests run at once as there are cores.
+struct Turn;
+
+impl Turn {
+    fn take() -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut taken = RETURNED
+            .wait_while(taken, |taken| *taken >= cores)
+            .unwrap_or_else(PoisonError::into_inner);
+        *taken += 1;
+        Self
+    }
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        RETURNED.notify_one();
+    }
+}
 
 /// A directory for runs, with a registry of its own.
 pub struct Workplace {
@@ -46,7 +69,7 @@ pub struct Workplace {
     /// Reports every name that appears in the registry: the shared memory of a run carries it.
     registry: OwnedFd,
     names: RefCell<BTreeSet<String>>,
-    _turn: MutexGuard<'static, ()>,
+    _turn: Turn,
 }
 
 impl Drop for Workplace {
@@ -72,7 +95,7 @@ impl Drop for Workplace {
 
 impl Workplace {
     pub fn new() -> Self {
-        let turn = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = Turn::take();
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("run");
         DirBuilder::new().mode(0o700).create(&path).unwrap();

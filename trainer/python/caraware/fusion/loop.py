@@ -19,7 +19,6 @@ from caraware.learn.ppo import NonFiniteLoss
 from caraware.learn.stored import FUSION
 from caraware.report.evaluation import Evaluation, Mean
 from caraware.report.metrics import Metrics, TrainingPoint
-from caraware.report.plots import plot_headline
 from caraware.run.checkpoint import Keeping, TrainingHistory, load_checkpoint, load_history, save_checkpoint
 from caraware.run.config import RunConfig
 from caraware.run.continuation import Continuation
@@ -135,6 +134,9 @@ class FusionLoop:
         self._metrics.close()
         if self._left:
             return False
+        # Loaded here: matplotlib takes a fifth of the time in which a trainer starts.
+        from caraware.report.plots import plot_headline
+
         folder = self._config.run_dir / "plots"
         plot_headline(folder, self._headline, self._metrics.training, self._metrics.evaluations)
         self._write_part()

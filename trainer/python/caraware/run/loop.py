@@ -15,7 +15,6 @@ from caraware.learn.ranks import RankError, Ranks, Verdict
 from caraware.learn.rollout import DrawnTick
 from caraware.report.evaluation import EvaluationResult, pooled
 from caraware.report.metrics import Metrics, TrainingPoint
-from caraware.report.plots import plot_headline, plot_sigma
 from caraware.run.checkpoint_writer import CheckpointWriter
 from caraware.run.config import RunConfig
 from caraware.run.curriculum import Curriculum
@@ -330,6 +329,9 @@ class TrainingLoop:
         log.info("left to a successor after %d updates", self._updates())
 
     def _draw(self) -> None:
+        # Loaded here: matplotlib takes a fifth of the time in which a trainer starts.
+        from caraware.report.plots import plot_headline, plot_sigma
+
         folder = self._config.run_dir / "plots"
         metrics = self._metrics
         try:
