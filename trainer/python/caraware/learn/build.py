@@ -23,6 +23,7 @@ from caraware.learn.config import (
 )
 from caraware.learn.fast import FastUpdate, threads_per_network
 from caraware.learn.fast_mlp import FastMlp
+from caraware.learn.gpu import has_usable_gpu
 from caraware.learn.graphed import GraphedUpdate
 from caraware.learn.gru import recurrent_policy, recurrent_value
 from caraware.learn.networks import Activation, GaussianPolicy, Mlp, policy_mlp, value_mlp
@@ -155,7 +156,7 @@ def configure_torch(config: TrainerConfig) -> torch.device:
     """Set what torch keeps per process: threads within an operation, and the precision of matrix products."""
     torch.set_num_threads(threads_per_network(config))
     amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
-    gpu = config.device is TrainerDevice.AUTO and torch.cuda.is_available()
+    gpu = config.device is TrainerDevice.AUTO and has_usable_gpu()
     is_auto = config.matmul_precision is MatmulPrecision.AUTO
     reduced = config.matmul_precision is MatmulPrecision.BFLOAT16 or (is_auto and amx and not gpu)
     # On a GPU "auto" is TensorFloat-32: 10 bits of mantissa, float32's range.

@@ -23,6 +23,8 @@ import safetensors.torch as safetensors
 import torch
 from torch import Tensor
 
+from caraware.learn.gpu import has_usable_gpu
+
 WAIT_AT_MOST = timedelta(hours=1)
 """For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
 MEET_WITHIN = timedelta(minutes=5)
@@ -178,11 +180,11 @@ class TorchRanks(Ranks):
             raise RankError(f"`trainer.ranks` is {ranks}, and torchrun started {started} processes")
         self._is_shared = False
         """Several ranks learn on one GPU, which NCCL refuses: what they add up goes through the CPU."""
-        if torch.cuda.is_available():
+        if has_usable_gpu():
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
             self._is_shared = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) > torch.cuda.device_count()
         with self._together("meeting"):
-            nccl = torch.cuda.is_available() and not self._is_shared
+            nccl = has_usable_gpu() and not self._is_shared
             backend = "cpu:gloo,cuda:nccl" if nccl else "gloo"
             if meeting is None:
                 dist.init_process_group(backend, timeout=WAIT_AT_MOST)
