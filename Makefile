@@ -7,9 +7,14 @@ PYTHON310 ?= python3.10
 CARGO_FLAGS := --release --locked
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
+# 1 installs CUDA's libraries, which torch asks for and which need 4 GB. Without a driver none is called: see scripts/without_cuda.py.
+GPU ?= $(if $(wildcard /dev/nvidiactl /dev/dxg /proc/driver/nvidia/version),1,0)
+# Directory of `make install`, and what the installed package can do beside training: extras of trainer/pyproject.toml.
+PREFIX ?=
+EXTRAS ?= envs,data,metrics
 
-.PHONY: train test build programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
-	model deny bench peers peers-metadrive peers-smarts faces site clean
+.PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
+	timed-packages timed-programs with-cuda model deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -22,10 +27,19 @@ test: prerequisites browser $(VENV)/.sumo ## all tests
 	$(MAKE) --jobs=2 --output-sync=line test-rust test-python
 
 # Python's packages are downloaded and unpacked while Rust's are compiled.
-build: prerequisites $(VENV)/.sumo ## virtual environment, SUMO, all programs, the Python extension
-	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/.installed programs
+build: prerequisites ## virtual environment, SUMO, all programs, the Python extension
+	@scripts/stages.sh begin
+	@scripts/stages.sh time "SUMO" $(MAKE) --no-print-directory $(VENV)/.sumo
+	@$(MAKE) --no-print-directory --jobs=2 timed-packages timed-programs
 	$(EXTENSION)
 	$(COMMAND)
+	@scripts/stages.sh show
+
+timed-packages:
+	@scripts/stages.sh time "Python's packages" $(MAKE) --no-print-directory $(VENV)/.installed
+
+timed-programs:
+	@scripts/stages.sh time "beside them programs" $(MAKE) --no-print-directory programs
 
 programs:
 	cargo build $(CARGO_FLAGS)
@@ -55,13 +69,40 @@ $(VENV)/.sumo: requirements.lock
 
 # The pins are in requirements.lock; the packages of this project are installed in place.
 $(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/requirements-devkits.txt trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
-	@echo "installing Python's packages into $(VENV): 7 GB on disk"
-	$(VENV)/bin/pip install --disable-pip-version-check --quiet -r requirements.lock
+	@echo "installing Python's packages into $(VENV): $(if $(filter 1,$(GPU)),7 GB on disk,3.2 GB on disk, and no CUDA: GPU=1 installs it)"
+	$(call PINS,$(VENV))
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps -r trainer/requirements-devkits.txt
 	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
 		> $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
 	touch $@
+
+# The environment $(1) gets the pins of requirements.lock, or of those that the packages $(2) ask for. Python compiles a module when it
+# is first imported: most never are.
+PINS = $(VENV)/bin/python scripts/pins.py --gpu $(GPU) $(2) > $(1)/pins.txt && \
+	$(1)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-compile -r $(1)/pins.txt && \
+	$(if $(filter 1,$(GPU)),rm -f $(1)/.without-cuda,touch $(1)/.without-cuda && $(1)/bin/python scripts/without_cuda.py)
+
+# An environment without CUDA gets it as soon as there is a GPU.
+ifneq ($(filter 1,$(GPU)),)
+ifneq ($(wildcard $(VENV)/.without-cuda),)
+$(VENV)/.installed: with-cuda
+endif
+endif
+with-cuda:
+
+wheels: build ## wheels of the trainer with all programs, and of the viewer: target/wheels
+	rm -rf target/wheels
+	scripts/wheels.sh $(VENV)/bin/python target/wheels
+
+install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/bin/caraware
+	@if [ -z "$(PREFIX)" ]; then echo "make install PREFIX=DIRECTORY makes an environment there" >&2; exit 2; fi
+	$(PYTHON) -m venv $(PREFIX)
+	$(call PINS,$(PREFIX),trainer[$(EXTRAS)] viewer)
+	$(PREFIX)/bin/pip install --disable-pip-version-check --quiet --no-deps --force-reinstall target/wheels/*.whl
+
+image: ## a container image of Containerfile, by podman, buildah or docker
+	scripts/image.sh caraware GPU=$(GPU)
 
 # A test thread more than cores: most tests start whole runs, which wait for each other much of the time.
 test-rust:

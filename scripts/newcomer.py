@@ -237,6 +237,9 @@ def main() -> int:
     """Run the pages that the command line names, or all."""
     named = [Path(word).resolve() for word in sys.argv[1:] if not word.startswith("--")]
     pages = named or [ROOT / "README.md", *sorted((ROOT / "docs" / "tutorials").glob("*.md"))]
+    if not named:
+        left_out = sorted(page.stem for page in (ROOT / "docs").glob("*.md"))
+        print(f"not followed, but their command lines are parsed (--test documentation): docs/ {', '.join(left_out)}")
     results = [run_page(page) for page in pages]
     failures, seconds = sum(count for count, _ in results), sum(time_s for _, time_s in results)
     print(f"{len(pages)} pages in {seconds:.0f} s, {failures} failures")

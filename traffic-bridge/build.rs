@@ -53,6 +53,8 @@ fn link(sumo: &Path) {
     println!("cargo:rustc-link-lib=dylib=sumocpp");
     println!("cargo:rustc-link-lib=dylib=tracicpp");
     println!("cargo:rustc-link-arg=-Wl,-rpath,{}", library.display());
+    // Where the wheel of the trainer has the program, from `caraware/programs` (trainer/setup.py).
+    println!("cargo:rustc-link-arg=-Wl,-rpath,$ORIGIN/../../sumo/lib64");
     // Tests and examples find the wheel's scenarios and tools here; the program itself reads the path from its run file.
     println!("cargo:rustc-env=CARAWARE_BUILD_SUMO_HOME={}", sumo.display());
 }

@@ -24,6 +24,7 @@ INCLUDED = {"docs/benchmarks/parts.md"}
 NAVIGATION = {
     "First steps": [
         "docs/capabilities",
+        "docs/install",
         "docs/peers",
         "docs/glossary",
         "configs/README",

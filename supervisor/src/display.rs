@@ -51,6 +51,42 @@ pub struct ProgressDisplay {
     begin: Option<ProgressBegin>,
     /// Ticks of all environments, and since when they are so many.
     newest: Option<(u64, Instant)>,
+    start: StartTimes,
+}
+
+/// When a run reached the stages of its start, until its first update is reported.
+#[derive(Debug)]
+struct StartTimes {
+    started: Instant,
+    first_tick_s: Option<f64>,
+    is_reported: bool,
+}
+
+impl StartTimes {
+    fn new() -> Self {
+        Self {
+            started: Instant::now(),
+            first_tick_s: None,
+            is_reported: false,
+        }
+    }
+
+    /// Notes the stages that a run from nothing has reached; the line that reports its first update, once.
+    fn report(&mut self, ticks: u64, updates: u64, ready_at: Option<Instant>) -> Option<String> {
+        let now_s = self.started.elapsed().as_secs_f64();
+        if self.first_tick_s.is_none() && ticks > 0 {
+            self.first_tick_s = Some(now_s);
+        }
+        if self.is_reported || updates == 0 {
+            return None;
+        }
+        self.is_reported = true;
+        let ready_s = ready_at?.saturating_duration_since(self.started).as_secs_f64();
+        Some(format!(
+            "first training step {now_s:.1} s after the start: processes ready at {ready_s:.1} s, first tick at {:.1} s",
+            self.first_tick_s?
+        ))
+    }
 }
 
 /// Where the rates of a run begin: a resumed one continues the counts of its earlier parts.
@@ -77,6 +113,7 @@ impl ProgressDisplay {
             shares: PhaseShares::new(),
             begin: None,
             newest: None,
+            start: StartTimes::new(),
         }
     }
 
@@ -91,6 +128,7 @@ impl ProgressDisplay {
             shares: PhaseShares::new(),
             begin: None,
             newest: None,
+            start: StartTimes::new(),
         }
     }
 
@@ -107,6 +145,13 @@ impl ProgressDisplay {
             return;
         }
         let view = self.view(environments, ready_at, notes);
+        let begins_from_nothing = environments.first().is_some_and(|first| first.run.beginning.is_none());
+        if begins_from_nothing && let Some(line) = self.start.report(view.all_ticks, view.updates, ready_at) {
+            match &self.bar {
+                Some(bar) => bar.println(line),
+                None => notice(&line),
+            }
+        }
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
                 bar.set_style(style());
@@ -343,5 +388,23 @@ impl ProgressView {
             ),
             _ => format!("{:8} steps  {}", self.steps, self.text()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_update_is_reported_once_with_what_came_before_it() {
+        let (mut start, ready_at) = (StartTimes::new(), Some(Instant::now()));
+        assert_eq!(start.report(0, 0, None), None);
+        assert_eq!(start.report(12, 0, ready_at), None);
+        let line = start.report(300, 1, ready_at).unwrap_or_default();
+        assert!(
+            line.starts_with("first training step 0.0 s after the start: processes ready at 0.0 s"),
+            "{line}"
+        );
+        assert_eq!(start.report(400, 2, ready_at), None);
     }
 }

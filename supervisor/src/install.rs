@@ -31,7 +31,7 @@ impl Install {
     pub fn find() -> Result<Self, Exit> {
         let bin = programs()?;
         let python = python(&bin)?;
-        let sumo_home = sumo_home(&python)?;
+        let sumo_home = sumo_home(&bin, &python)?;
         Ok(Self { bin, python, sumo_home })
     }
 
@@ -108,7 +108,7 @@ pub fn become_module(name: &str, arguments: impl IntoIterator<Item = impl AsRef<
     Err(Exit::io("start", &python, &error))
 }
 
-/// Python of the project's virtual environment, or the one that `CARAWARE_PYTHON` names.
+/// Python of the project's virtual environment or of the one that the programs are in, or the one that `CARAWARE_PYTHON` names.
 ///
 /// # Errors
 /// There is none.
@@ -116,8 +116,14 @@ pub fn python(bin: &Path) -> Result<PathBuf, Exit> {
     if let Some(path) = std::env::var_os("CARAWARE_PYTHON").filter(|path| !path.is_empty()) {
         return Ok(path.into());
     }
-    bin.ancestors()
-        .map(|directory| directory.join(".venv/bin/python"))
+    // A wheel puts the programs into its environment. The command that it installs also sets `CARAWARE_PYTHON`.
+    let is_environment = |directory: &&Path| directory.join("pyvenv.cfg").is_file();
+    let own = bin
+        .ancestors()
+        .find(is_environment)
+        .map(|directory| directory.join("bin/python"));
+    own.into_iter()
+        .chain(bin.ancestors().map(|directory| directory.join(".venv/bin/python")))
         .find(|path| path.exists())
         .ok_or_else(|| {
             Exit::missing(
@@ -127,9 +133,17 @@ pub fn python(bin: &Path) -> Result<PathBuf, Exit> {
         })
 }
 
-fn sumo_home(python: &Path) -> Result<PathBuf, Exit> {
+fn sumo_home(bin: &Path, python: &Path) -> Result<PathBuf, Exit> {
     if let Some(path) = std::env::var_os("CARAWARE_SUMO_HOME").filter(|path| !path.is_empty()) {
         return Ok(path.into());
+    }
+    // The programs of an installed wheel are in `caraware/programs`, beside the packages that it asks for.
+    let beside = bin
+        .parent()
+        .and_then(Path::parent)
+        .map(|packages| packages.join("sumo"));
+    if let Some(home) = beside.filter(|home| home.join("bin/sumo").is_file()) {
+        return Ok(home);
     }
     let library = python
         .parent()

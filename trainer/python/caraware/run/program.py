@@ -11,9 +11,15 @@ class ProgramError(Exception):
 
 
 def caraware_program() -> Path:
-    """`CARAWARE`, the build beside this package or this Python, or the one in `PATH`. Raises `ProgramError`."""
+    """`CARAWARE`, the one of this wheel, the build beside this package or this Python, or the one in `PATH`.
+
+    Raises `ProgramError`.
+    """
     if named := os.environ.get("CARAWARE"):
         return Path(named)
+    installed = Path(__file__).parents[1] / "programs" / "caraware"
+    if installed.is_file():
+        return installed
     roots = [*Path(__file__).parents, *Path(sys.executable).parents]
     for root in roots:
         program = root / "target" / "release" / "caraware"
