@@ -16,8 +16,10 @@ from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-GPU_ONLY = re.compile(r"(nvidia-(?!cuda-runtime|cuda-cupti)|cuda-|triton)")
-"""torch computes on a CPU without these. CUDA's runtime finds that there is no GPU; the profiler calls CUPTI."""
+CALLED_ON_A_CPU = {"nvidia-cuda-runtime", "nvidia-cuda-cupti"}
+"""What torch calls of CUDA without a GPU: the runtime finds that there is none, and the profiler opens CUPTI."""
+GPU_ONLY = re.compile(r"nvidia-|cuda-|triton")
+"""Beginnings of the names of other packages that torch asks for, for a GPU."""
 REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([\w\s,.-]+)\])?[^;]*(?:;(.*))?")
 
 
@@ -82,9 +84,11 @@ def main() -> None:
     parser.add_argument("--gpu", type=int, choices=(0, 1), required=True, help="1: also CUDA's libraries and Triton")
     parser.add_argument("projects", nargs="*", help="directories of packages, with extras; without, all pins")
     options = parser.parse_args()
-    needed = closure(options.projects) if options.projects else None
+    # The package that asks for the two is for a GPU, and may be absent.
+    needed = closure(options.projects) | CALLED_ON_A_CPU if options.projects else None
     for name, line in pins().items():
-        if (needed is None or name in needed) and (options.gpu or not GPU_ONLY.match(name)):
+        is_left_out = not options.gpu and name not in CALLED_ON_A_CPU and GPU_ONLY.match(name)
+        if (needed is None or name in needed) and not is_left_out:
             print(line)
 
 
