@@ -123,6 +123,7 @@ model: prerequisites $(VENV)/.installed ## the models and the parsers for longer
 	CARAWARE_LOOM_PREEMPTIONS=4 cargo test $(CARGO_FLAGS) --test boards_under_loom
 	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test hostile_frames
 	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test messages
+	CARAWARE_FUZZ_FRAMES=1000000 cargo test $(CARGO_FLAGS) --test fanout a_flood
 	cd viewer && CARAWARE_FUZZ_FRAMES=7000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
 	$(MIRI) -- --skip noise::
 	export MIRIFLAGS="-Zmiri-disable-data-race-detector -Zmiri-many-seeds=0..64"; $(MIRI) --features racing-board -- a_board_that

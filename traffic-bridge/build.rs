@@ -17,6 +17,7 @@ fn main() {
         "population.cc",
         "heroes.cc",
         "over_traci.cc",
+        "xml_paths.cc",
         "engine.h",
         "lanes.h",
         "error_tee.h",
@@ -38,6 +39,7 @@ fn main() {
             "src/sumo/population.cc",
             "src/sumo/heroes.cc",
             "src/sumo/over_traci.cc",
+            "src/sumo/xml_paths.cc",
         ])
         .std("c++17")
         .include(sumo.join("include"))

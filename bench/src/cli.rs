@@ -27,6 +27,8 @@ pub enum BenchPart {
     Driving,
     /// Recording: wall time of a run that is recorded, as a watcher and without loss, compared with the same run alone
     Record,
+    /// Watching: wall and processor time of a tick with a recorder beside the run, compared with the same run without, segment by segment
+    Watch,
     /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
     Endurance,
     /// Soak: growth of memory, handles and logs of one long run with viewers and handovers

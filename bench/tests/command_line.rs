@@ -26,6 +26,7 @@ fn the_help_shows_the_command_and_every_part() {
         "scale",
         "peers",
         "record",
+        "watch",
         "endurance",
         "soak",
         "all",

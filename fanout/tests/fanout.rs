@@ -377,6 +377,66 @@ fn garbage_is_counted_and_not_fatal() {
     assert_eq!(fanout.exit_code(), Some(0));
 }
 
+/// Frames of random bytes at the socket, and random samples of a client that zenoh lets in: neither ends the fan-out nor reaches a viewer.
+/// `CARAWARE_FUZZ_FRAMES` chooses how many of each.
+#[test]
+fn a_flood_at_the_endpoint_changes_nothing() {
+    let frames: u64 = std::env::var("CARAWARE_FUZZ_FRAMES").map_or(20_000, |text| text.parse().unwrap());
+    let run = Run::new("flood", Mode::Simulate);
+    let mut fanout = run.start_fanout();
+    let viewer = run.attach();
+    let world = watch(&viewer, run.key(Topic::World));
+    let (sim, worlds) = publisher(&run, Channel::World);
+    until("attendance", || {
+        sim.board_of(Process::Fanout).unwrap().progress().attached == 1
+    });
+    let mut random = 1_u64;
+    let mut bytes = |count: usize| -> Vec<u8> {
+        let mut draw = || {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (random >> 33) as u8
+        };
+        (0..count).map(|_| draw()).collect()
+    };
+    // zenoh's frames begin with their length. It closes a connection at the first that it cannot read, so each has a connection.
+    let connections = frames / 20;
+    for number in 0..connections {
+        let Ok(mut port) = TcpStream::connect(("127.0.0.1", run.port)) else { continue };
+        for _ in 0..20 {
+            let length = 1 + bytes(1)[0] % 90;
+            let mut frame = vec![length, 0];
+            // Half of the frames begin as one that opens a session.
+            frame.push(if number % 2 == 0 { 0x01 } else { bytes(1)[0] });
+            frame.extend(bytes(usize::from(length) - 1));
+            if port.write_all(&frame).is_err() {
+                break;
+            }
+        }
+    }
+    let forger = run.attach();
+    for number in 0..frames {
+        let key = run.key(Topic::ALL[number as usize % Topic::ALL.len()]);
+        let length = usize::from(bytes(1)[0]);
+        forger.put(&key, bytes(length)).wait().unwrap();
+    }
+    let mut tick = 0;
+    until("a frame of the run", || {
+        tick += 1;
+        send_world(&sim, &worlds, tick, 0, 3);
+        let Ok(Some(sample)) = world.recv_timeout(std::time::Duration::from_millis(200)) else {
+            return false;
+        };
+        let received = sample.payload().to_bytes();
+        assert!(
+            fanout::reader::check("world", &received, Some(run.file.run_id)).is_ok(),
+            "a forged frame has arrived"
+        );
+        true
+    });
+    send_world(&sim, &worlds, tick + 1, LAST_OF_RUN, 3);
+    assert_eq!(fanout.exit_code(), Some(0));
+}
+
 /// A killed fan-out that is started again shows the run to a viewer that was connected before.
 #[test]
 fn viewers_reconnect_to_a_restarted_fan_out() {

@@ -238,7 +238,11 @@ pub const CHANNELS: [ChannelSpec; 15] = [
             let sub_steps = run.config.run.sub_steps as usize;
             WorldLayout::with_heroes(road_users(run), sub_steps, run.config.heroes()).len
         },
-        queue_length: windowful,
+        // A trainer that watches is behind sensor-daemon by another window.
+        queue_length: |run| match run.config.trainer.road_users {
+            true => 3 * windowful(run),
+            false => windowful(run),
+        },
         in_hand: |run| two_batches(windowful(run)),
         is_used: |_| true,
     },
@@ -519,7 +523,9 @@ impl Channel {
     #[must_use]
     pub fn max_subscribers(self) -> usize {
         let required = self.spec().required.len();
-        (2 * required + 2).max(5)
+        // A trainer that reads `world` (`trainer.road_users`), and its successor.
+        let trainers = if matches!(self, Self::World) { 2 } else { 0 };
+        (2 * required + 2).max(5) + trainers
     }
 
     /// Longest payload of a run, bytes.
@@ -543,7 +549,8 @@ impl Channel {
             return 0;
         }
         // The required consumers that the run has, at least one subscriber, and the fan-out.
-        let subscribers = self.required(run).filter(|&process| process != Recorder).count().max(1) + 1;
+        let watching = usize::from(self == Self::World && run.config.trainer.road_users);
+        let subscribers = self.required(run).filter(|&process| process != Recorder).count().max(1) + 1 + watching;
         // A recorder copies each message as it comes, so it has one in hand.
         let recorded = match run.config.record.records(self) {
             true => (spec.queue_length)(run) + 1,

@@ -35,6 +35,8 @@ impl Mode {
     }
 }
 
+/// Version of the layout of a run's directory, in `report.json` (docs/run-directory.md).
+pub const LAYOUT_VERSION: u32 = 1;
 /// Log of a curriculum in the run directory: the first lesson and tick of each stage.
 pub const CURRICULUM_LOG: &str = "curriculum.jsonl";
 /// File in the run directory with the ids of a scenario's road users in order of appearance, each a line of JSON.

@@ -10,7 +10,7 @@ use std::{
 use ipc_schema::{
     metric::{self, METRICS, MetricSpec},
     process::Process,
-    run::{Mode, RunFile},
+    run::{LAYOUT_VERSION, Mode, RunFile},
     storage,
 };
 use serde::Deserialize;
@@ -310,6 +310,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "disk_full": housekeeping.disk_full,
         "shortened_logs": housekeeping.shortened_logs,
     });
+    report["layout_version"] = json!(LAYOUT_VERSION);
     add_estimators(&mut report, metric, &trainer);
     let path = run.run_dir.join("report.json");
     let text = format!("{report:#}\n");

@@ -117,6 +117,8 @@ pub struct Supervisor {
     /// The newest of these ends.
     memory_note: Option<String>,
     ready_at: Option<Instant>,
+    /// The runtime directory was removed, and that was reported.
+    is_runtime_dir_lost: bool,
     /// Time of the check before the present one. A process that is found ready now became ready after it.
     last_check: Instant,
 }
@@ -161,6 +163,7 @@ impl Supervisor {
             memory,
             memory_note: None,
             ready_at: None,
+            is_runtime_dir_lost: false,
             last_check: Instant::now(),
         })
     }
@@ -170,7 +173,8 @@ impl Supervisor {
         let started = Instant::now();
         let ending = match self.run_until_over(started, display) {
             Ok(ending) => ending,
-            Err(exit) => RunEnding::Failed(exit),
+            // Whatever fails without the directory fails for want of it.
+            Err(exit) => RunEnding::Failed(self.find_run_dir().err().unwrap_or(exit)),
         };
         // The run is over: answer what still waits, then end what still runs.
         self.handovers
@@ -197,6 +201,8 @@ impl Supervisor {
             self.handovers.advance(&mut self.processes);
             self.controls.advance()?;
             self.record_ready(started)?;
+            self.find_run_dir()?;
+            self.find_runtime_dir();
             self.watch_stalls();
             display.update(self.processes.environments(), self.ready_at, &self.notes());
             self.last_check = Instant::now();
@@ -207,6 +213,32 @@ impl Supervisor {
                 return Ok(RunEnding::Interrupted);
             }
         }
+    }
+
+    /// Ends a run whose directory has been removed: nothing of it could be kept.
+    fn find_run_dir(&self) -> Result<(), Exit> {
+        let directory = &self.processes.run().run_dir;
+        if directory.is_dir() {
+            return Ok(());
+        }
+        Err(Exit::run(
+            format!("the run's directory {} was removed while the run was alive", directory.display()),
+            "its checkpoints and results are lost: start the run again, and remove directories of runs that have ended only",
+        ))
+    }
+
+    /// Reports once that the runtime directory of a live run has been removed.
+    fn find_runtime_dir(&mut self) {
+        let directory = &self.processes.run().shared_memory.root;
+        if self.is_runtime_dir_lost || directory.is_dir() {
+            return;
+        }
+        self.is_runtime_dir_lost = true;
+        display::notice(&format!(
+            "the runtime directory {} was removed: the run continues, but takes no commands, and a process that dies ends it; Ctrl-C ends \
+             it with a checkpoint",
+            directory.display()
+        ));
     }
 
     /// Handles ended processes: a reported failure of a required one ends the run; others are started again.

@@ -15,7 +15,7 @@ use std::{
     process::{Child, Stdio},
 };
 
-use common::{Spectator, Workplace, text, until, with_mounts};
+use common::{Spectator, Workplace, assert_documented, free_port, text, until, with_mounts};
 use ipc_schema::{activity::Awaited, channel::Channel, process::Process};
 use recorder::file::reader::RecordingReader;
 use rustix::process::{Pid, Signal, kill_process};
@@ -69,6 +69,37 @@ fn spawn(workplace: &Workplace, arguments: &[&str]) -> Child {
     command.spawn().unwrap()
 }
 
+/// The first tick that a replay to viewers plays, and its simulated seconds per wall second.
+const PLAYED_FROM: u64 = 200;
+const PLAYED_SPEED: f64 = 20.0;
+
+/// Plays the recording of the run `live` to a viewer from [`PLAYED_FROM`] on, compares some messages, and returns the report.
+fn play_to_viewers(workplace: &Workplace, recording: &RecordingReader) -> serde_json::Value {
+    let from_s = (PLAYED_FROM / 10).to_string();
+    let speed = PLAYED_SPEED.to_string();
+    let arguments = ["replay", "live", "--from-s", &from_s, "--speed", &speed, "--name", "seen"];
+    let port = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
+    let mut replay = spawn(workplace, &[&arguments[..], &["--set", &port]].concat());
+    let spectator = Spectator::join_after(&run_dir(workplace, "seen").join("run.json"), &mut replay, Process::SensorDaemon);
+    let world = spectator.subscribe(Channel::World);
+    let mut seen = Vec::new();
+    while seen.len() < 5 {
+        let message = until(&mut replay, "a message", || world.receive().unwrap());
+        seen.push((message.header().tick, message.payload().to_vec()));
+    }
+    assert!(seen.iter().all(|(tick, _)| *tick >= PLAYED_FROM));
+    for message in recording.channel_messages().map_while(Result::ok) {
+        let same = |(tick, _): &&(u64, Vec<u8>)| message.channel == Channel::World && *tick == message.header.tick;
+        if let Some((tick, payload)) = seen.iter().find(same) {
+            assert_eq!(message.payload(), payload, "tick {tick}");
+        }
+    }
+    drop((world, spectator));
+    let output = replay.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    workplace.report("seen")
+}
+
 #[test]
 fn learning_from_a_lossless_recording_gives_the_parameters_of_the_run() {
     let workplace = Workplace::new();
@@ -105,6 +136,19 @@ fn learning_from_a_lossless_recording_gives_the_parameters_of_the_run() {
         learnt(&run_dir(&workplace, "again")),
         learnt(&run_dir(&workplace, "live"))
     );
+    workplace.assert_nothing_left();
+    for name in ["live", "again"] {
+        assert_documented(&run_dir(&workplace, name));
+    }
+
+    // Viewers get what was recorded, from the time that they ask for, at the speed that they ask for.
+    let played = play_to_viewers(&workplace, &recording);
+    assert_eq!(played["first_tick"], PLAYED_FROM, "{played:#}");
+    let ticks = every.len() as u64 - PLAYED_FROM;
+    assert_eq!(played["ticks"], ticks, "{played:#}");
+    // The last tick is due that long after the first.
+    let least_s = (ticks - 1) as f64 * 0.1 / PLAYED_SPEED;
+    assert!(played["wall_s"].as_f64().unwrap() >= least_s, "{least_s}: {played:#}");
     workplace.assert_nothing_left();
 
     // The same run again is the same recording; another seed is another from its first tick on.

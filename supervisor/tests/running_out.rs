@@ -257,6 +257,38 @@ fn processes_that_die_while_the_disk_is_full_are_replaced() {
     assert!(report["restarts"].as_u64().unwrap() >= 1, "{report:#}");
 }
 
+/// The directory of a run, or the one with its sockets, is removed while the run is alive.
+#[test]
+fn a_directory_that_vanishes_is_named() {
+    let workplace = Workplace::new();
+    for (name, removed, says, code) in [
+        ("results", "runs/results", "was removed while the run was alive", 1),
+        ("sockets", "run", "takes no commands", 130),
+    ] {
+        let said = workplace.path().join(format!("{name}.txt"));
+        let mut command = workplace.command(&train(name, &["episode.training_episodes=100000"]));
+        let mut run = command.stderr(File::create(&said).unwrap()).spawn().unwrap();
+        let begun = workplace.path().join("runs").join(name).join("learning.jsonl");
+        until(&mut run, "update", || begun.exists().then_some(()));
+        std::fs::remove_dir_all(workplace.path().join(removed)).unwrap();
+        if code == 130 {
+            until(&mut run, says, || {
+                std::fs::read_to_string(&said).unwrap().contains(says).then_some(())
+            });
+            kill_process(Pid::from_child(&run), Signal::INT).unwrap();
+        }
+        let status = run.wait().unwrap();
+        // Lines are broken to the width of the terminal.
+        let said = std::fs::read_to_string(&said).unwrap();
+        let words = said.split_whitespace().filter(|word| *word != "│").collect::<Vec<_>>().join(" ");
+        assert!(words.contains(says) && !said.contains("panicked"), "{said}");
+        assert_eq!(status.code(), Some(code), "{said}");
+    }
+    let report = workplace.report("sockets");
+    assert!(report["result"] == "interrupted" && report["checkpoint"].is_string(), "{report:#}");
+    assert!(workplace.shared_memory().is_empty(), "{:?}", workplace.shared_memory());
+}
+
 /// `command` in a shell that first runs `before`.
 fn in_shell(command: &Command, before: &str) -> Command {
     let mut shell = Command::new("sh");

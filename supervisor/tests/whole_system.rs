@@ -16,7 +16,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{Workplace, command_lines, free_port, sumo_program, text, tool};
+use common::{Workplace, assert_documented, command_lines, free_port, sumo_program, text, tool};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -104,6 +104,7 @@ fn a_run_trains_reports_and_leaves_nothing_behind() {
         .filter(|entry| entry.metadata().unwrap().len() > 0)
         .count();
     assert!(events > 0, "no TensorBoard events");
+    assert_documented(&run);
     assert!(
         text(&output).contains("mean error on 4 unseen seeds (± 95 %): policy"),
         "{}",

@@ -90,6 +90,8 @@ struct Attached {
     radar: Option<Subscriber>,
     /// Opened by the first call of `lane_positions`.
     lanes: Option<Subscriber>,
+    /// Opened by the first call of `road_users`.
+    world: Option<Subscriber>,
     predictions: Publisher,
     /// Wakes `sim-core`, which waits for predictions in the driving task.
     sim_core: Option<Waker>,
@@ -218,6 +220,19 @@ impl Attachment {
         let mut inner = self.lock()?;
         let Attached { lanes, membership, .. } = &mut *inner;
         sights(py, lanes, membership, Service::LanePosition)
+    }
+
+    /// Messages of `world` since the last call; only the oldest, if there were more than the queue holds. The first call returns none from
+    /// before it.
+    fn road_users(&self, py: Python<'_>) -> PyResult<Vec<SightMessage>> {
+        let mut inner = self.lock()?;
+        let Attached { world, membership, .. } = &mut *inner;
+        if !membership.run.config.trainer.road_users {
+            return Err(PyRuntimeError::new_err(
+                "the run was started without `trainer.road_users`: set it to true, for instance with --set trainer.road_users=true",
+            ));
+        }
+        sights(py, world, membership, Service::World)
     }
 
     /// Number of ticks that `traffic-bridge` is ahead of the newest tick consumed here.
@@ -488,6 +503,7 @@ impl Attachment {
             images: None,
             radar: None,
             lanes: None,
+            world: None,
             predictions,
             sim_core,
             traffic_bridge,
@@ -823,6 +839,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(exchange, module)?)?;
     module.add("METRICS", PyTuple::new(module.py(), METRICS.iter().map(Metric::of))?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
+    module.add("LAYOUT_VERSION", ipc_schema::run::LAYOUT_VERSION)?;
     let layout = ipc_schema::layout::json().map_err(|error| failed(&error))?;
     module.add("LAYOUT_JSON", layout)?;
     module.add("VALID", ipc_schema::observation::VALID)?;

@@ -1,4 +1,4 @@
-//! Images, radar scans and lane positions for Python, copied out of shared memory: one that Python keeps does not block the next one.
+//! Images, radar scans, lane positions and road users for Python, copied out of shared memory: one that Python keeps does not block the next one.
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -8,10 +8,11 @@ use ipc_schema::{
     ports::Message,
     radar::RadarLayout,
     services::Channel,
+    world::WorldLayout,
 };
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 
-/// What one camera or one radar has sent at a tick, or where all road users are on their lanes.
+/// What one camera or one radar has sent at a tick, or where all road users are.
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct SightMessage {
     header: MessageHeader,
@@ -30,6 +31,7 @@ impl SightMessage {
                 let layout = LanePositionLayout::of(&header);
                 vec![layout.sumo_time_s, layout.positions]
             }
+            Channel::World => vec![WorldLayout::of(&header).states],
             _ => {
                 let layout = RadarLayout::of(&header);
                 vec![layout.scan, layout.detections]

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -247,6 +248,40 @@ def test_a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_u
         with pytest.raises(CheckpointError):
             load_checkpoint(newest, loaded)
         load_checkpoint(before, loaded)
+
+
+def test_eighty_damaged_files_are_refused_with_their_name_or_load_what_was_saved(tmp_path: Path) -> None:
+    written = save(tmp_path, fresh())
+    expected = everything(fresh())[0]
+    draw = random.Random(1)
+    originals = {file: file.read_bytes() for file in sorted(written.iterdir())}
+    refused = 0
+    for number in range(80):
+        file = sorted(originals)[number % len(originals)]
+        content = bytearray(originals[file])
+        place = draw.randrange(len(content))
+        match number // len(originals) % 4:
+            case 0:
+                content[place] ^= 1 << draw.randrange(8)
+            case 1:
+                del content[place:]
+            case 2:
+                del content[place : place + draw.randrange(1, 40)]
+            case _:
+                content[place:place] = draw.randbytes(draw.randrange(1, 40))
+        file.write_bytes(content)
+        loaded = fresh(seed=5)
+        try:
+            load_checkpoint(written, loaded)
+        except CheckpointError as error:
+            refused += 1
+            assert error.file == file and file.name in str(error), error
+            assert newest_sound_checkpoint(tmp_path) is None
+        else:
+            # A damage that changes nothing that counts, such as a byte of a name.
+            assert torch.equal(everything(loaded)[0], expected)
+        file.write_bytes(originals[file])
+    assert refused >= 70, refused
 
 
 def test_the_newest_sound_checkpoint_is_found_past_damaged_ones(

@@ -128,6 +128,16 @@ def test_runs_are_compared_by_what_they_differ_in(run_dirs: list[Path]) -> None:
     assert all(math.isfinite(mean) for mean, _ in runs[0].estimates.values())
 
 
+def test_a_directory_of_another_layout_is_refused_with_both_versions(run_dirs: list[Path], tmp_path: Path) -> None:
+    for name in ("report.json", "config.toml"):
+        (tmp_path / name).write_text((run_dirs[0] / name).read_text())
+    report = json.loads((tmp_path / "report.json").read_text())
+    (tmp_path / "report.json").write_text(json.dumps(report | {"layout_version": 999}))
+    ran = _report(tmp_path)
+    assert ran.returncode == 2, ran.stderr
+    assert "version 999" in ran.stderr and f"reads {report['layout_version']}" in ran.stderr
+
+
 def test_a_directory_without_a_report_is_refused(tmp_path: Path) -> None:
     ran = _report(tmp_path)
     assert ran.returncode == 2 and str(tmp_path) in ran.stderr and "Traceback" not in ran.stderr

@@ -58,6 +58,8 @@ pub struct TrainerConfig {
     pub truncation_ticks: u64,
     /// Train a network of the policy's size by regression beside it.
     pub supervised: bool,
+    /// The trainer reads the channel `world` beside its observations.
+    pub road_users: bool,
     /// Reward by name.
     pub reward: Reward,
     /// Scale of `bounded_inverse` and `exponential`, metres.

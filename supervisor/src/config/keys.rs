@@ -394,6 +394,7 @@ pub const KEYS: &[ConfigKey] = &[
     other("trainer.activation", ValueKind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; that of the policy's last hidden layer is always tanh."),
     integer("trainer.truncation_ticks", "ticks", 1, 100_000, "Ticks over which a gradient propagates back in a network with memory."),
     other("trainer.supervised", ValueKind::Flag, "Train a network of the policy's size by regression to the truth, for comparison (docs/baselines.md)."),
+    other("trainer.road_users", ValueKind::Flag, "Let the trainer read the states and boxes of all road users at each tick (`channel.road_users()`, docs/environments.md): its queue of the channel `world` is made long enough. False = it is as long as the simulators need."),
     other("trainer.reward", ValueKind::Choice(&["inverse", "bounded_inverse", "exponential"]), "Reward of a prediction at distance d from the truth: 1/d, 1/(1+d/scale), exp(−d/scale)."),
     float("trainer.reward_scale_m", "m", 0.001, 1e6, "The scale in `trainer.reward`."),
     integer("trainer.ranks", "", 1, 1024, "Trainers that learn one policy together by torch.distributed, each in its own run; `caraware.parallel` sets it (docs/parallel.md)."),

@@ -185,6 +185,34 @@ impl Workplace {
     }
 }
 
+/// Asserts that every entry of a run's directory is in the table of `docs/run-directory.md`, which has the version of the report.
+pub fn assert_documented(run_dir: &Path) {
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/run-directory.md")).unwrap();
+    let report = std::fs::read_to_string(run_dir.join("report.json")).unwrap();
+    let report: Value = serde_json::from_str(&report).unwrap();
+    let version = format!("**version {}**", report["layout_version"]);
+    assert!(page.contains(&version), "{version}");
+    let first_cells = page
+        .lines()
+        .filter_map(|line| line.strip_prefix("| `")?.split(" | ").next());
+    let names: BTreeSet<&str> = first_cells
+        .flat_map(|cell| cell.split(", "))
+        .map(|name| name.trim_matches(['`', '/']))
+        .collect();
+    for entry in std::fs::read_dir(run_dir).unwrap().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        // A number stands for `N`, a format for `FORMAT`.
+        let numbered: String = name
+            .chars()
+            .map(|letter| if letter.is_ascii_digit() { 'N' } else { letter })
+            .collect();
+        let is_known = names.contains(name.as_str())
+            || names.contains(numbered.as_str())
+            || name.strip_prefix("export-").is_some();
+        assert!(is_known, "docs/run-directory.md has no row for {name}");
+    }
+}
+
 /// Files of any run in shared memory.
 fn shared_memory() -> Vec<String> {
     let names = std::fs::read_dir("/dev/shm")
@@ -279,7 +307,12 @@ pub struct Spectator {
 impl Spectator {
     /// Joins the run as soon as its services exist.
     pub fn join(run_file: &Path, run: &mut Child) -> Self {
-        let started = run_file.with_file_name("logs").join("traffic-bridge.log");
+        Self::join_after(run_file, run, Process::TrafficBridge)
+    }
+
+    /// As [`Spectator::join`] where `first` is the first process to start.
+    pub fn join_after(run_file: &Path, run: &mut Child, first: Process) -> Self {
+        let started = run_file.with_file_name("logs").join(format!("{}.log", first.name()));
         caught(run, "services", || {
             // Processes start once all services exist; before that, services may be incomplete.
             started.exists().then_some(())?;

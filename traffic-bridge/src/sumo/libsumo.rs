@@ -173,6 +173,8 @@ pub mod ffi {
         fn take_messages(self: Pin<&mut Simulation>) -> String;
         /// Processor time of this thread, seconds.
         fn processor_seconds() -> f64;
+        /// Paths that SUMO has taken in this process through the functions of `xml_paths.cc`, which keep nothing.
+        fn paths_passed_to_sumo() -> u64;
         /// Processor time spent in SUMO's own step, in the pass of getters and in that over traffic lights since the start, seconds.
         fn seconds_in_step(self: &Simulation) -> f64;
         fn seconds_in_getters(self: &Simulation) -> f64;

@@ -424,6 +424,12 @@ pub fn processor_time_s() -> f64 {
     ffi::processor_seconds()
 }
 
+/// Paths that SUMO has taken in this process through our functions, which keep nothing of them: SUMO's own keep each for ever.
+#[must_use]
+pub fn paths_passed() -> u64 {
+    ffi::paths_passed_to_sumo()
+}
+
 /// Turns the failure of a call into an error that names what SUMO was asked to do.
 pub(crate) fn called<T>(action: &'static str, result: Result<T, cxx::Exception>) -> Result<T, SumoError> {
     result.map_err(|error| SumoError::Call {

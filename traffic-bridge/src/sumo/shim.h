@@ -78,6 +78,10 @@ public:
 
 // Processor time of this thread: the cost of a step, independent of other load on the machine.
 double processor_seconds();
+
+// Paths that SUMO has taken from its options, its files and its outputs in this process (xml_paths.cc).
+std::uint64_t paths_passed_to_sumo();
+
 // SUMO in this process.
 std::unique_ptr<Simulation> new_simulation();
 // SUMO in a process of its own.

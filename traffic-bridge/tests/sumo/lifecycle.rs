@@ -7,7 +7,7 @@ use ipc_schema::{
     traffic::{DISCONTINUOUS, Kind, MetaEvent},
 };
 use traffic_bridge::sumo::{
-    Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, options::SumoOptions,
+    Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, options::SumoOptions, paths_passed,
 };
 
 const TWO_CARS: &str = "<routes>\
@@ -119,6 +119,17 @@ fn a_second_sumo_is_refused_until_the_first_is_dropped() {
     first.close().unwrap();
     drop(Sumo::start(options.clone()).unwrap());
     Sumo::start(options).unwrap().close().unwrap();
+}
+
+/// SUMO's own functions for paths keep some 1.5 KiB at each start: the linker has to give it ours.
+#[test]
+fn sumo_takes_every_path_through_the_functions_that_keep_nothing() {
+    let bench = Bench::new();
+    let sumocfg = bench.scenario(TWO_CARS);
+    let before = paths_passed();
+    Sumo::start(bench.scenario_options(&sumocfg, 1.0)).unwrap().close().unwrap();
+    // The configuration, the net and the routes at least.
+    assert!(paths_passed() >= before + 3, "{}", paths_passed() - before);
 }
 
 /// The error of a start of SUMO with these options, as the user sees it.

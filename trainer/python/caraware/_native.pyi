@@ -24,6 +24,7 @@ __all__ = [
     "GNSS_COLUMNS",
     "IMU_COLUMNS",
     "LAYOUT_JSON",
+    "LAYOUT_VERSION",
     "METRICS",
     "RESYNCHRONISED",
     "SCHEMA_VERSION",
@@ -45,6 +46,8 @@ __all__ = [
 ]
 
 SCHEMA_VERSION: int
+LAYOUT_VERSION: int
+"""Version of the layout of a run's directory, in its `report.json`."""
 """Version of the layouts in shared memory; every process of a run has the same."""
 
 METRICS: tuple[Metric, ...]
@@ -123,6 +126,12 @@ class Attachment:
         """Radar scans since the last call, oldest first; the newest of them if there were more than fit.
 
         The first call subscribes and gives none. Raises RuntimeError.
+        """
+
+    def road_users(self) -> list[SightMessage]:
+        """Messages of `world` since the last call, oldest first; only the oldest if there were more than fit.
+
+        The first call subscribes and gives none. Raises RuntimeError, also in a run without `trainer.road_users`.
         """
 
     def lane_positions(self) -> list[SightMessage]:

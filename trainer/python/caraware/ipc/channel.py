@@ -22,6 +22,7 @@ from caraware.ipc.image import Image
 from caraware.ipc.lane_positions import LanePositions
 from caraware.ipc.pointcloud import PointCloud
 from caraware.ipc.radar import RadarDetections
+from caraware.ipc.road_users import RoadUserStates
 from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import TrainingReport
 
@@ -420,6 +421,15 @@ class Channel:
         the number of its observation, except ticks that a restarted trainer receives again.
         """
         return [LanePositions.of(message) for message in self._attachment.lane_positions()]
+
+    def road_users(self) -> list[RoadUserStates]:
+        """States and boxes of all road users since the last call, oldest first (`trainer.road_users`).
+
+        The first call subscribes and gives none. Call it after each `receive`: every tick from then on comes once, with
+        the number of its observation, except ticks that a restarted trainer receives again. Raises RuntimeError in a
+        run without `trainer.road_users`.
+        """
+        return [RoadUserStates.of(message) for message in self._attachment.road_users()]
 
     def consumed(self, tick: int) -> None:
         """Gives the simulation credit for all ticks up to and including `tick`."""

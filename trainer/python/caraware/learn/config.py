@@ -131,7 +131,9 @@ class TrainerConfig:
     def from_run(cls, run: RunFile) -> "TrainerConfig":
         """Read `run["config"]["trainer"]`, and the seed in `run["config"]["run"]`. Raises `ConfigError`."""
         section = config_table(run, "trainer") | {"seed": setting(run, "run.seed", int)}
-        section.pop("module", None)
+        # These say which trainer there is, and what it may read.
+        for key in ("module", "road_users"):
+            section.pop(key, None)
         keys = {_key(f.name) for f in fields(cls)}
         if wrong := sorted(keys ^ set(section)):
             what = "lacks the key" if wrong[0] in keys else "has the unknown key"

@@ -79,6 +79,12 @@ class FinishedRun:
             self.name = str(self.report["name"])
         except (OSError, ValueError, KeyError) as error:
             raise ReportError(f"{directory}: no report of a run that has ended: {error}") from error
+        version = self.report.get("layout_version")
+        if version != _native.LAYOUT_VERSION:
+            raise ReportError(
+                f"{directory}: its layout has version {version}, this program reads {_native.LAYOUT_VERSION}: "
+                "use the program that made the run"
+            )
 
     @property
     def settings(self) -> dict[str, str]:
