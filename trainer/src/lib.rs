@@ -90,7 +90,7 @@ struct Attached {
     radar: Option<Subscriber>,
     /// Opened by the first call of `lane_positions`.
     lanes: Option<Subscriber>,
-    /// Opened by the first call of `road_users`.
+    /// In a run with `trainer.road_users`.
     world: Option<Subscriber>,
     predictions: Publisher,
     /// Wakes `sim-core`, which waits for predictions in the driving task.
@@ -222,8 +222,7 @@ impl Attachment {
         sights(py, lanes, membership, Service::LanePosition)
     }
 
-    /// Messages of `world` since the last call; only the oldest, if there were more than the queue holds. The first call returns none from
-    /// before it.
+    /// Messages of `world` since the last call; only the oldest, if there were more than the queue holds.
     fn road_users(&self, py: Python<'_>) -> PyResult<Vec<SightMessage>> {
         let mut inner = self.lock()?;
         let Attached { world, membership, .. } = &mut *inner;
@@ -474,6 +473,11 @@ impl Attachment {
             true => Some(membership.subscriber(Service::Neighbours).map_err(membership_failed)?),
             false => None,
         };
+        // Before the simulation may send, so that only what it has made without a trainer is missed.
+        let world = match membership.run.config.trainer.road_users {
+            true => Some(membership.subscriber(Service::World).map_err(membership_failed)?),
+            false => None,
+        };
         let predictions = membership.publisher(Service::Prediction).map_err(membership_failed)?;
         let sim_core = match membership.run.config.drives() {
             true => Some(membership.waker(Process::SimCore).map_err(membership_failed)?),
@@ -503,7 +507,7 @@ impl Attachment {
             images: None,
             radar: None,
             lanes: None,
-            world: None,
+            world,
             predictions,
             sim_core,
             traffic_bridge,

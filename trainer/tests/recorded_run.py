@@ -60,6 +60,29 @@ def recorded_run(
         yield Path(short, "runs", name)
 
 
+def assert_has_card(directory: Path, run_dir: Path) -> None:
+    """An export says what it is: run, seed, hashes, versions, sensors and licence."""
+    card, recording = (directory / "README.md").read_text(), open_recording(run_dir)
+    assert recording.end is not None
+    start = recording.start
+    words = (
+        start["config_hash"],
+        recording.end["observation_hash"],
+        start["program_version"],
+        f"schema {start['schema_version']}",
+    )
+    for word in (
+        *words,
+        f"| seed | {start['seed']} |",
+        "noise_std_deg",
+        "### lidar",
+        "### radar",
+        "## Licence",
+        "## Parts",
+    ):
+        assert word in card, word
+
+
 def unseen(done: int, total: int) -> None:
     """A progress bar that shows nothing."""
 

@@ -17,15 +17,13 @@ from caraware.ipc.road_users import RoadUserStates
 def main(run_file: str) -> None:
     """Take part in the run, and compare each observation's truth with the states of its tick."""
     channel = Channel(run_file)
-    found: dict[str, Any] = dict.fromkeys(("ticks", "without", "rows", "unknown", "others"), 0)
+    found: dict[str, Any] = dict.fromkeys(("ticks", "first", "gaps", "rows", "unknown", "others"), 0)
     found |= {"largest_error_m": 0.0, "smallest_box_m": 99.0}
     if not channel.run["config"]["trainer"]["road_users"]:
         try:
             channel.road_users()
         except RuntimeError as error:
             found["refused"] = str(error)
-    else:
-        channel.road_users()
     by_tick: dict[int, RoadUserStates] = {}
     last = False
     while not last:
@@ -38,7 +36,7 @@ def main(run_file: str) -> None:
             found["ticks"] += 1
             world = by_tick.pop(obs.tick, None)
             if world is None:
-                found["without"] += 1
+                found["first" if found["rows"] == 0 else "gaps"] += 1
                 continue
             assert world.sim_time_ns == obs.sim_time_ns
             places = {int(vehicle): place for place, vehicle in enumerate(world.states["vehicle"])}

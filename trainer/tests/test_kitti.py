@@ -21,7 +21,7 @@ from caraware.ipc.image import split_planes
 from caraware.ipc.pointcloud import rotation
 from PIL import Image
 from pykitti.utils import load_oxts_packets_and_poses
-from recorded_run import ASKEW, RecordedFrame, in_world_m, recorded_run, unseen
+from recorded_run import ASKEW, RecordedFrame, assert_has_card, in_world_m, recorded_run, unseen
 
 TILT_M = 0.15
 """How far a corner of a box is off since KITTI's boxes only turn about the camera's y axis: braking cars nod by 1°."""
@@ -134,6 +134,7 @@ def kitti(askew_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The exported episode."""
     directory = tmp_path_factory.mktemp("kitti")
     assert export(askew_run, "kitti", directory, 1, unseen) == 1
+    assert_has_card(directory, askew_run)
     return directory / "episode-00000.kitti"
 
 

@@ -14,7 +14,7 @@ from caraware.data import Recording, RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.rows import table
 from caraware.data.names import RoadUsers
-from recorded_run import recorded_run, unseen
+from recorded_run import assert_has_card, recorded_run, unseen
 
 SETTINGS = {
     "episode.ticks": 150,
@@ -45,6 +45,7 @@ def driving() -> Iterator[Path]:
 def _load(run_dir: Path, directory: Path, monkeypatch: pytest.MonkeyPatch) -> minari.MinariDataset:
     """Export a run, and let Minari find the data set by its name."""
     assert export(run_dir, "minari", directory, 2, unseen) == 3
+    assert_has_card(directory, run_dir)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(directory))
     assert list(minari.list_local_datasets(compatible_minari_version=True)) == ["a_run-v0"]
     return minari.load_dataset("a_run-v0")

@@ -23,7 +23,7 @@ from nuscenes.utils.geometry_utils import points_in_box, view_points
 from nuscenes.utils.splits import get_scenes_of_custom_split
 from PIL import Image
 from pyquaternion import Quaternion
-from recorded_run import ASKEW, RecordedFrame, recorded_run, unseen
+from recorded_run import ASKEW, RecordedFrame, assert_has_card, recorded_run, unseen
 
 Frames = dict[tuple[int, int], RecordedFrame]
 
@@ -37,7 +37,7 @@ def recording(askew_run: Path) -> Recording:
 def devkit(askew_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     directory = tmp_path_factory.mktemp("nuscenes")
     assert export(askew_run, "nuscenes", directory, 1, unseen) == 1
-    assert "Licence" in (directory / "README.md").read_text()
+    assert_has_card(directory, askew_run)
     yield NuScenes(version=VERSION, dataroot=str(directory), verbose=False)
 
 

@@ -14,7 +14,7 @@ from caraware.data.export.__main__ import export
 from caraware.data.export.opv2v import pose, world_from_pose
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.pointcloud import rotation
-from recorded_run import of_carriers, recorded_run, unseen
+from recorded_run import assert_has_card, of_carriers, recorded_run, unseen
 
 SETTINGS = {
     "traffic.cavs": 6,
@@ -77,6 +77,7 @@ def test_a_pose_is_the_same_transform_in_both_frames() -> None:
 
 def test_points_and_boxes_of_every_agent_meet_in_the_world(run_dir: Path, tmp_path: Path) -> None:
     assert export(run_dir, "opv2v", tmp_path, 1, unseen) == 1
+    assert_has_card(tmp_path, run_dir)
     agents = _scenario(tmp_path / "episode-00000.opv2v")
     assert len(agents) >= 3
     scans = of_carriers(run_dir)

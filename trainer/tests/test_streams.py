@@ -28,7 +28,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoders
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoders
 from PIL import Image
 from pyquaternion import Quaternion
-from recorded_run import ASKEW, RecordedFrame, recorded_run, unseen
+from recorded_run import ASKEW, RecordedFrame, assert_has_card, recorded_run, unseen
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
@@ -194,7 +194,7 @@ def exports(askew_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     directories = {name: tmp_path_factory.mktemp(name) for name in ("foxglove", "ros2")}
     for name, directory in directories.items():
         assert export(askew_run, name, directory, 1, unseen) == 1
-        assert "Licence" in (directory / "README.md").read_text()
+        assert_has_card(directory, askew_run)
     return directories
 
 

@@ -131,7 +131,7 @@ class Attachment:
     def road_users(self) -> list[SightMessage]:
         """Messages of `world` since the last call, oldest first; only the oldest if there were more than fit.
 
-        The first call subscribes and gives none. Raises RuntimeError, also in a run without `trainer.road_users`.
+        Raises RuntimeError, also in a run without `trainer.road_users`.
         """
 
     def lane_positions(self) -> list[SightMessage]:

@@ -425,9 +425,9 @@ class Channel:
     def road_users(self) -> list[RoadUserStates]:
         """States and boxes of all road users since the last call, oldest first (`trainer.road_users`).
 
-        The first call subscribes and gives none. Call it after each `receive`: every tick from then on comes once, with
-        the number of its observation, except ticks that a restarted trainer receives again. Raises RuntimeError in a
-        run without `trainer.road_users`.
+        Call it after each `receive`: every tick comes once, with the number of its observation, except the first ticks,
+        which the simulation makes before there is a trainer (at most two windows, `run.window_ticks`), and ticks that
+        a restarted trainer receives again. Raises RuntimeError in a run without `trainer.road_users`.
         """
         return [RoadUserStates.of(message) for message in self._attachment.road_users()]
 

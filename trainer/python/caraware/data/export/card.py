@@ -8,7 +8,7 @@ from typing import Any
 from caraware import _native
 from caraware.data.recording import Episode, Recording
 
-SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic", "camera")
+SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic", "camera", "radar")
 """Tables of the configuration that describe sensors."""
 
 
