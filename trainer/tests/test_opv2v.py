@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import yaml
 from caraware.data.export.__main__ import export
-from caraware.data.export.opv2v import pose, world_from_pose
+from caraware.data.export.opv2v import mask_pixel, pose, world_from_pose
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.pointcloud import rotation
+from PIL import Image
 from recorded_run import assert_has_card, of_carriers, recorded_run, unseen
 
 SETTINGS = {
@@ -67,6 +68,28 @@ def _scenario(path: Path) -> dict[int, dict[str, Any]]:
     }
 
 
+def _check_mask(stem: Path, labels: dict[str, Any]) -> tuple[int, int]:
+    """Whether the mask of a frame has those road users that its agent sees; how many it has, and how many it lacks."""
+    mask = np.asarray(Image.open(f"{stem}_bev_visibility.png"))
+    assert mask.shape == (256, 256) and set(np.unique(mask)) <= {0, 255}
+    boxes = list(labels["vehicles"].values())
+    places = np.array([[*box["location"][:2], box["location"][2], 1.0] for box in boxes])
+    in_lidar = np.linalg.solve(world_from_pose(labels["lidar_pose"]), places.T).T
+    seen_m = in_lidar[[box["points"] > 0 for box in boxes], :2]
+    counts = [0, 0]
+    for box, place, (column, row) in zip(boxes, in_lidar, np.rint(mask_pixel(in_lidar)).astype(int), strict=True):
+        if np.abs(place[:2]).max() > 48:
+            continue
+        if box["points"] > 0:
+            # A pedestrian is about a pixel wide.
+            assert mask[row - 1 : row + 2, column - 1 : column + 2].any(), (stem, box)
+            counts[0] += 1
+        elif len(seen_m) == 0 or np.linalg.norm(seen_m - place[:2], axis=1).min() > 12:
+            assert mask[row, column] == 0, (stem, box)
+            counts[1] += 1
+    return counts[0], counts[1]
+
+
 def test_a_pose_is_the_same_transform_in_both_frames() -> None:
     # No symmetry hides a sign here.
     position_m, attitude_rad = np.array([12.0, -7.0, 1.5]), (0.05, -0.11, 2.2)
@@ -82,9 +105,9 @@ def test_points_and_boxes_of_every_agent_meet_in_the_world(run_dir: Path, tmp_pa
     assert len(agents) >= 3
     scans = of_carriers(run_dir)
     assert sum(len(frames) for frames in agents.values()) == len(scans)
-    on_boxes = 0
+    on_boxes = masked = unmasked = 0
     for agent, frames in agents.items():
-        for stamp, (labels, points, intensity) in list(frames.items())[::7]:
+        for stamp, (labels, points, intensity) in list(frames.items())[::3]:
             frame = scans[agent, int(stamp)]
             scan, recorded = frame.scan, frame.points
             in_world = points @ world_from_pose(labels["lidar_pose"])[:3, :3].T + labels["lidar_pose"][:3]
@@ -102,7 +125,9 @@ def test_points_and_boxes_of_every_agent_meet_in_the_world(run_dir: Path, tmp_pa
                 in_box = (on_it - centre) @ world_from_pose([0, 0, 0, *box["angle"]])[:3, :3]
                 assert np.all(np.abs(in_box[:, :2]) < np.array(box["extent"])[:2] + 0.1), (stamp, vehicle)
                 on_boxes += len(on_it)
+            seen, unseen_by_it = _check_mask(tmp_path / "episode-00000.opv2v" / str(agent) / stamp, labels)
+            masked, unmasked = masked + seen, unmasked + unseen_by_it
             own = states[agent]
             heading_deg = labels["true_ego_pos"][4]
             assert heading_deg == pytest.approx(-math.degrees(own["yaw_rad"]))
-    assert on_boxes > 100
+    assert on_boxes > 100 and masked > 15 and unmasked > 8

@@ -1,7 +1,8 @@
 """OPV2V: cooperative perception with any number of agents, as OpenCOOD loads it.
 
 A part is a directory of one episode (a *scenario* there), with a directory for each vehicle that carries a LIDAR and,
-in it, a `.yaml` and a `.pcd` for each tick. Coordinates are CARLA's: left-handed, y to the south, degrees.
+in it, a `.yaml`, a `.pcd` and a mask of what it sees for each tick. Coordinates are CARLA's: left-handed, y to the
+south, degrees.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from caraware.data.export.scans import box_middle, forward_m, require_channels
 from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
@@ -17,6 +19,9 @@ from caraware.ipc.arrays import Float64Array
 
 LABELLED_WITHIN_M = 150.0
 """Distance from the LIDAR up to which road users are labelled."""
+
+MASK_SIZE, MASK_MIDDLE, MASK_PIXEL_M = 256, 127, 0.39
+"""Pixels of a side of `_bev_visibility.png`, the pixel of the LIDAR in both directions, and the length of one (m)."""
 
 
 def pose(position_m: Any, attitude_rad: Any) -> list[float]:
@@ -72,6 +77,27 @@ def _box(state: np.void) -> dict[str, Any]:
         "location": angles[:3],
         "speed": float(np.hypot(*state["velocity_body_mps"][:2])) * 3.6,
     }
+
+
+def mask_pixel(lidar_m: Float64Array) -> Float64Array:
+    """f64 [count, 2]: column and row of points [count, 2 or 3] in the LIDAR's left-handed frame: ahead is up."""
+    return MASK_MIDDLE + np.stack((lidar_m[:, 1], -lidar_m[:, 0]), 1) / MASK_PIXEL_M
+
+
+def _mask(scan: np.void, points: Array, states: Array) -> Image.Image:
+    """What the agent sees from above: 255 where a road user stands that its LIDAR has hit, else 0."""
+    world_from_lidar = world_from_pose(pose(scan["position_m"], scan["attitude_rad"]))
+    image = Image.new("L", (MASK_SIZE, MASK_SIZE))
+    draw = ImageDraw.Draw(image)
+    for state in states[np.isin(states["vehicle"], points["object"])]:
+        box = _box(state)
+        length_m, width_m, _ = box["extent"]
+        corners = np.array([[x, y, 0, 1] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))], np.float64)
+        corners[:, :2] *= length_m, width_m
+        in_world = corners @ world_from_pose([*box["location"], *box["angle"]]).T
+        in_lidar = np.linalg.solve(world_from_lidar, in_world.T).T
+        draw.polygon([(float(column), float(row)) for column, row in mask_pixel(in_lidar)], fill=255)
+    return image
 
 
 def _yaml(scan: np.void, points: Array, states: Array) -> str:
@@ -131,4 +157,5 @@ def _write_scan(path: Path, message: Message, world: dict[int, Array]) -> None:
     agent.mkdir(exist_ok=True)
     name = f"{message.tick:06}"
     (agent / f"{name}.yaml").write_text(_yaml(scan, points, world[message.tick]), encoding="utf-8")
+    _mask(scan, points, world[message.tick]).save(agent / f"{name}_bev_visibility.png")
     write_pcd(agent / f"{name}.pcd", _points(scan, points), points["intensity"])
