@@ -1,7 +1,6 @@
 //! Measures what a recorder beside a live run costs it: in one run, with the recorder there and not there, in many short segments.
 
 use std::{
-    cmp::Ordering,
     fs,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
@@ -105,7 +104,7 @@ fn report(
     load: &str,
 ) -> Result<BenchReport, Exit> {
     let [wall, cpu, null_wall, null_cpu] =
-        [&ratios.wall, &ratios.cpu, &ratios.null_wall, &ratios.null_cpu].map(MedianInterval::of);
+        [&ratios.wall, &ratios.cpu, &ratios.null_wall, &ratios.null_cpu].map(|ratios| MedianInterval::of(ratios));
     let wall = wall.ok_or_else(|| Exit::run("no segment was measured", ""))?;
     let mut report = BenchReport::new(
         "watch",
@@ -144,7 +143,9 @@ fn report(
             " With fewer than {CORES} cores the recorder takes processor time from the run itself: nothing follows from the ratio of wall times."
         );
     } else if wall.low > MOST {
-        report.faults.push(format!("watching costs more than 1 %: {:.4}", wall.median));
+        report
+            .faults
+            .push(format!("watching costs more than 1 %: {:.4}", wall.median));
     }
     Ok(report)
 }
@@ -180,9 +181,9 @@ struct MedianInterval {
 
 impl MedianInterval {
     /// Any distribution: the number of values below its median is binomial. `None` without a value.
-    fn of(values: &Vec<f64>) -> Option<Self> {
-        let mut sorted = values.clone();
-        sorted.sort_by(|one, other| one.partial_cmp(other).unwrap_or(Ordering::Equal));
+    fn of(values: &[f64]) -> Option<Self> {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
         let count = sorted.len();
         let last = count.checked_sub(1)?;
         // Values left out at each end: as many as keep the probability of both tails at 5 % or below.
@@ -336,7 +337,10 @@ impl WatchedRun {
         // Its last line: `FILE: A MB of B MB, N ticks missed`.
         let before = |word: &str| said.rsplit_once(word)?.0.split_whitespace().last()?.parse::<f64>().ok();
         let (Some(message_mb), Some(missed)) = (before(" MB, "), before(" ticks missed")) else {
-            return Err(Exit::run(format!("the recorder ended with {}: {said}", output.status), ""));
+            return Err(Exit::run(
+                format!("the recorder ended with {}: {said}", output.status),
+                "",
+            ));
         };
         self.message_mb += message_mb;
         self.missed_ticks += missed;
@@ -372,7 +376,10 @@ struct LoopWork {
 
 /// Processor time of all threads of a process, seconds. The kernel counts it in nanoseconds here.
 fn threads_cpu_s(pid: i32) -> f64 {
-    let threads = fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    let threads = fs::read_dir(format!("/proc/{pid}/task"))
+        .into_iter()
+        .flatten()
+        .flatten();
     let nanoseconds = threads.filter_map(|thread| {
         let text = fs::read_to_string(thread.path().join("schedstat")).ok()?;
         text.split_whitespace().next()?.parse::<f64>().ok()
@@ -408,7 +415,7 @@ mod tests {
     #[test]
     fn the_interval_of_a_median_is_that_of_the_sign_test() {
         let of = |count: i32| {
-            let interval = MedianInterval::of(&(1..=count).rev().map(f64::from).collect()).unwrap();
+            let interval = MedianInterval::of(&(1..=count).rev().map(f64::from).collect::<Vec<_>>()).unwrap();
             [interval.low, interval.median, interval.high]
         };
         // Conover's table: 95 % and more between the 2nd and the 9th of ten, the 10th and the 21st of thirty.
@@ -416,7 +423,7 @@ mod tests {
         assert_eq!(of(30), [10.0, 15.5, 21.0]);
         // With fewer than six values even the extremes are no interval of 95 %.
         assert_eq!(of(3), [1.0, 2.0, 3.0]);
-        assert_eq!(MedianInterval::of(&Vec::new()), None);
+        assert_eq!(MedianInterval::of(&[]), None);
     }
 
     #[test]
@@ -427,6 +434,9 @@ mod tests {
         };
         let mut ratios = SegmentRatios::default();
         ratios.add([cost(1.0), cost(3.0)], cost(4.0));
-        assert_eq!((ratios.wall[0], ratios.cpu[0], ratios.null_wall[0]), (2.0, 2.0, 1.0 / 3.0));
+        assert_eq!(
+            (ratios.wall[0], ratios.cpu[0], ratios.null_wall[0]),
+            (2.0, 2.0, 1.0 / 3.0)
+        );
     }
 }

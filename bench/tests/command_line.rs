@@ -42,6 +42,27 @@ fn an_unknown_part_is_refused_as_wrong_usage() {
     assert!(text.contains("possible values: lidar"), "{text}");
 }
 
+/// A recorder comes and goes beside a live run, and every block gives a ratio.
+#[test]
+fn a_recorder_that_watches_is_measured_within_one_run() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let (code, text) = answer(&["watch", "--quick", "--json", file.path().to_str().unwrap()]);
+    assert_eq!(code, Some(0), "{text}");
+    let report: serde_json::Value = serde_json::from_reader(file).unwrap();
+    for what in ["wall time", "processor time"] {
+        for beside in ["watched", "alone beside alone"] {
+            let figure = |part: &str| {
+                report["figures"][format!("{what} of a tick, {beside}, {part}")]
+                    .as_f64()
+                    .unwrap()
+            };
+            let [low, median, high] = ["low", "median", "high"].map(figure);
+            assert!(0.0 < low && low <= median && median <= high, "{what}, {beside}: {text}");
+        }
+    }
+    assert!(report["figures"]["MB/s of messages"].as_f64().unwrap() > 0.0, "{text}");
+}
+
 /// Every kind of disturbance happens: the runs must end as the undisturbed ones.
 #[test]
 fn disturbed_runs_end_as_if_nothing_had_happened() {

@@ -393,7 +393,9 @@ fn a_flood_at_the_endpoint_changes_nothing() {
     let mut random = 1_u64;
     let mut bytes = |count: usize| -> Vec<u8> {
         let mut draw = || {
-            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            random = random
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             (random >> 33) as u8
         };
         (0..count).map(|_| draw()).collect()
@@ -401,7 +403,9 @@ fn a_flood_at_the_endpoint_changes_nothing() {
     // zenoh's frames begin with their length. It closes a connection at the first that it cannot read, so each has a connection.
     let connections = frames / 20;
     for number in 0..connections {
-        let Ok(mut port) = TcpStream::connect(("127.0.0.1", run.port)) else { continue };
+        let Ok(mut port) = TcpStream::connect(("127.0.0.1", run.port)) else {
+            continue;
+        };
         for _ in 0..20 {
             let length = 1 + bytes(1)[0] % 90;
             let mut frame = vec![length, 0];

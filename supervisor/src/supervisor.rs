@@ -222,7 +222,10 @@ impl Supervisor {
             return Ok(());
         }
         Err(Exit::run(
-            format!("the run's directory {} was removed while the run was alive", directory.display()),
+            format!(
+                "the run's directory {} was removed while the run was alive",
+                directory.display()
+            ),
             "its checkpoints and results are lost: start the run again, and remove directories of runs that have ended only",
         ))
     }

@@ -77,10 +77,16 @@ const PLAYED_SPEED: f64 = 20.0;
 fn play_to_viewers(workplace: &Workplace, recording: &RecordingReader) -> serde_json::Value {
     let from_s = (PLAYED_FROM / 10).to_string();
     let speed = PLAYED_SPEED.to_string();
-    let arguments = ["replay", "live", "--from-s", &from_s, "--speed", &speed, "--name", "seen"];
+    let arguments = [
+        "replay", "live", "--from-s", &from_s, "--speed", &speed, "--name", "seen",
+    ];
     let port = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
     let mut replay = spawn(workplace, &[&arguments[..], &["--set", &port]].concat());
-    let spectator = Spectator::join_after(&run_dir(workplace, "seen").join("run.json"), &mut replay, Process::SensorDaemon);
+    let spectator = Spectator::join_after(
+        &run_dir(workplace, "seen").join("run.json"),
+        &mut replay,
+        Process::SensorDaemon,
+    );
     let world = spectator.subscribe(Channel::World);
     let mut seen = Vec::new();
     while seen.len() < 5 {

@@ -280,12 +280,19 @@ fn a_directory_that_vanishes_is_named() {
         let status = run.wait().unwrap();
         // Lines are broken to the width of the terminal.
         let said = std::fs::read_to_string(&said).unwrap();
-        let words = said.split_whitespace().filter(|word| *word != "│").collect::<Vec<_>>().join(" ");
+        let words = said
+            .split_whitespace()
+            .filter(|word| *word != "│")
+            .collect::<Vec<_>>()
+            .join(" ");
         assert!(words.contains(says) && !said.contains("panicked"), "{said}");
         assert_eq!(status.code(), Some(code), "{said}");
     }
     let report = workplace.report("sockets");
-    assert!(report["result"] == "interrupted" && report["checkpoint"].is_string(), "{report:#}");
+    assert!(
+        report["result"] == "interrupted" && report["checkpoint"].is_string(),
+        "{report:#}"
+    );
     assert!(workplace.shared_memory().is_empty(), "{:?}", workplace.shared_memory());
 }
 

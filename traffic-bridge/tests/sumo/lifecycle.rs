@@ -127,7 +127,10 @@ fn sumo_takes_every_path_through_the_functions_that_keep_nothing() {
     let bench = Bench::new();
     let sumocfg = bench.scenario(TWO_CARS);
     let before = paths_passed();
-    Sumo::start(bench.scenario_options(&sumocfg, 1.0)).unwrap().close().unwrap();
+    Sumo::start(bench.scenario_options(&sumocfg, 1.0))
+        .unwrap()
+        .close()
+        .unwrap();
     // The configuration, the net and the routes at least.
     assert!(paths_passed() >= before + 3, "{}", paths_passed() - before);
 }
