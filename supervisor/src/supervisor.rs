@@ -173,8 +173,7 @@ impl Supervisor {
         let started = Instant::now();
         let ending = match self.run_until_over(started, display) {
             Ok(ending) => ending,
-            // Whatever fails without the directory fails for want of it.
-            Err(exit) => RunEnding::Failed(self.find_run_dir().err().unwrap_or(exit)),
+            Err(exit) => RunEnding::Failed(exit),
         };
         // The run is over: answer what still waits, then end what still runs.
         self.handovers
@@ -184,6 +183,11 @@ impl Supervisor {
         display.update(self.processes.environments(), self.ready_at, &[]);
         display.finish();
         self.stop_all(&ending);
+        // What fails while the directory is being removed fails for want of it.
+        let ending = match (ending, self.find_run_dir()) {
+            (RunEnding::Failed(_), Err(removed)) => RunEnding::Failed(removed),
+            (ending, _) => ending,
+        };
         RunOutcome {
             ending,
             wall_s,
@@ -218,7 +222,8 @@ impl Supervisor {
     /// Ends a run whose directory has been removed: nothing of it could be kept.
     fn find_run_dir(&self) -> Result<(), Exit> {
         let directory = &self.processes.run().run_dir;
-        if directory.is_dir() {
+        // A process may make the directory itself again, but not this file.
+        if directory.join("run.json").is_file() {
             return Ok(());
         }
         Err(Exit::run(
