@@ -42,7 +42,7 @@ NAVIGATION = {
         "docs/tutorials/many-machines",
     ],
     "Traffic and vehicles": ["docs/import", "docs/traci", "docs/vehicle-model", "docs/scene", "docs/driving"],
-    "Sensors and messages": ["docs/sensor-models", "docs/lidar", "docs/camera", "docs/v2x"],
+    "Sensors and messages": ["docs/sensor-models", "docs/lidar", "docs/camera", "docs/suites", "docs/v2x"],
     "Learning": [
         "docs/environments",
         "docs/learners",

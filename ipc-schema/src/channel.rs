@@ -2,6 +2,7 @@
 //! of this crate derive from it (decision 21).
 
 use crate::{
+    config::Config,
     control::{MAX_SWITCHES, SensorSwitchLayout},
     ego::EgoPoseLayout,
     event::CollisionLayout,
@@ -15,6 +16,7 @@ use crate::{
     radar::{MOST_DETECTIONS, RadarLayout},
     run::RunFile,
     section::SectionSpec,
+    sensor::SensorKind,
     traffic::{
         EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, SIGNALS_PER_MESSAGE, TrafficLayout,
         TrafficMetaLayout,
@@ -155,6 +157,13 @@ fn censuses(run: &RunFile) -> usize {
     )]
     let seconds = (run.traffic_window_ticks() as f64 * run.config.run.tick_s).ceil() as usize;
     recorded_ahead(run, Channel::Census, seconds)
+}
+
+/// The largest size of the sensors of this kind.
+fn of_units(run: &RunFile, kind: SensorKind, size: impl Fn(&Config) -> usize) -> usize {
+    let units = run.config.sensor_units(kind);
+    let sizes = units.iter().map(|unit| size(&run.config.with_unit(unit)));
+    sizes.max().unwrap_or_else(|| size(&run.config))
 }
 
 /// A batch at work while the next one is taken.
@@ -330,14 +339,19 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         window: RunFile::window_ticks,
         topics: &["pointcloud"],
         when_full: FullQueue::DropOldest,
-        max_payload: |run| PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
+        max_payload: |run| {
+            let rays = of_units(run, SensorKind::Lidar, |config| {
+                config.lidar.rays_per_tick(config.run.tick_s)
+            });
+            PointcloudLayout::new(rays).len
+        },
         // The scans of one tick.
         queue_length: |run| {
-            let scans = run.config.lidar.vehicles as usize;
+            let scans = run.messages_per_tick(SensorKind::Lidar);
             scans + recorded_ahead(run, Channel::Pointcloud, scans * window(run)) + SPARE_MESSAGES
         },
         in_hand: |_| SPARE_MESSAGES,
-        is_used: |run| run.config.lidar.vehicles > 0,
+        is_used: |run| run.config.carries(SensorKind::Lidar),
     },
     ChannelSpec {
         channel: Channel::Switch,
@@ -370,11 +384,14 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropOldest,
-        max_payload: |run| ImageLayout::new(MOST_SEEN, ImagePlane::bytes(&run.config.camera)).len,
+        max_payload: |run| {
+            let planes = of_units(run, SensorKind::Camera, |config| ImagePlane::bytes(&config.camera));
+            ImageLayout::new(MOST_SEEN, planes).len
+        },
         // The messages of one tick.
-        queue_length: |run| run.config.camera.vehicles as usize + SPARE_MESSAGES,
+        queue_length: |run| run.messages_per_tick(SensorKind::Camera) + SPARE_MESSAGES,
         in_hand: |_| SPARE_MESSAGES,
-        is_used: |run| run.config.camera.vehicles > 0,
+        is_used: |run| run.config.carries(SensorKind::Camera),
     },
     ChannelSpec {
         channel: Channel::Radar,
@@ -390,9 +407,9 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         when_full: FullQueue::DropOldest,
         max_payload: |_| RadarLayout::new(MOST_DETECTIONS).len,
         // The messages of one tick.
-        queue_length: |run| run.config.radar.vehicles as usize + SPARE_MESSAGES,
+        queue_length: |run| run.messages_per_tick(SensorKind::Radar) + SPARE_MESSAGES,
         in_hand: |_| SPARE_MESSAGES,
-        is_used: |run| run.config.radar.vehicles > 0,
+        is_used: |run| run.config.carries(SensorKind::Radar),
     },
     ChannelSpec {
         channel: Channel::Measurement,

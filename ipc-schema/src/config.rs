@@ -13,6 +13,7 @@ mod record;
 mod region;
 mod scene;
 mod sensors;
+mod suite;
 pub(crate) mod text;
 mod trainer;
 mod ultrasonic;
@@ -28,6 +29,7 @@ pub use record::*;
 pub use region::*;
 pub use scene::*;
 pub use sensors::*;
+pub use suite::*;
 pub use trainer::*;
 pub use ultrasonic::*;
 pub use v2x::*;
@@ -75,6 +77,12 @@ pub struct Config {
     pub camera: CameraConfig,
     /// Radar.
     pub radar: RadarConfig,
+    /// Named sets of mounted sensors, and the vehicles that carry them.
+    #[serde(default, rename = "suite", skip_serializing_if = "Vec::is_empty")]
+    pub suites: Vec<SuiteConfig>,
+    /// Carriers that stand beside the road.
+    #[serde(default, rename = "roadside", skip_serializing_if = "Vec::is_empty")]
+    pub roadsides: Vec<RoadsideConfig>,
     /// Messages between road users.
     pub v2x: V2xConfig,
     /// What happens while a sensor is dark.

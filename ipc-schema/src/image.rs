@@ -1,6 +1,6 @@
 //! `image`: one image of one camera.
 //!
-//! One message for each vehicle that carries a camera and each image. The payload is one [`ImageHead`], the planes
+//! One message for each camera and each image. The payload is one [`ImageHead`], the planes
 //! that the configuration wants, and the road users in the image.
 
 use bytemuck::{Pod, Zeroable};
@@ -82,7 +82,7 @@ pub struct ImageHead {
     pub attitude_rad: [f64; 3],
     /// Hash of the vehicle's SUMO id.
     pub id_hash: u64,
-    /// Dense index of the vehicle within the episode.
+    /// Dense index of the vehicle within the episode, or [`crate::pointcloud::ROADSIDE_CARRIER`] and a number.
     pub vehicle: u32,
     /// Columns.
     pub width: u32,
@@ -94,6 +94,10 @@ pub struct ImageHead {
     pub focal_px: f32,
     /// Depth at which the image ends, metres.
     pub range_m: f32,
+    /// Number of the camera among those of the run ([`crate::config::SensorUnit`]).
+    pub sensor: u32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// A road user of which an image shows a pixel at least, with the fields of KITTI's labels.

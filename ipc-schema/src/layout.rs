@@ -223,6 +223,7 @@ pub fn table() -> Vec<TypeLayout> {
             axes,
             vehicle,
             azimuths,
+            sensor,
             reserved
         }),
         layout!(LanePosition {
@@ -245,7 +246,9 @@ pub fn table() -> Vec<TypeLayout> {
             height,
             planes,
             focal_px,
-            range_m
+            range_m,
+            sensor,
+            reserved
         }),
         layout!(SeenObject {
             object,
@@ -265,7 +268,9 @@ pub fn table() -> Vec<TypeLayout> {
             range_resolution_m,
             velocity_resolution_mps,
             velocity_ambiguity_mps,
-            azimuth_resolution_rad
+            azimuth_resolution_rad,
+            sensor,
+            reserved
         }),
         layout!(RadarDetection {
             object_id,

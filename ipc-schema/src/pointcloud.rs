@@ -1,6 +1,6 @@
 //! `pointcloud`: the returns of one LIDAR in a tick.
 //!
-//! One message for each vehicle that carries a LIDAR and each tick. The payload is one [`Scan`], then the points.
+//! One message for each LIDAR and each tick. The payload is one [`Scan`], then the points.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -45,6 +45,10 @@ pub const STATIC_OBJECT: u32 = 1 << 31;
 /// `object` of a point on the ground.
 pub const GROUND: u32 = u32::MAX;
 
+/// `vehicle` of a sensor beside the road: this bit, and the place of its carrier among `[[roadside]]`. Its `id_hash` is that of the
+/// carrier's name.
+pub const ROADSIDE_CARRIER: u32 = 1 << 30;
+
 /// One return.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
@@ -83,12 +87,14 @@ pub struct Scan {
     pub rays: u32,
     /// 1 for the paper's axes, 0 for x forward.
     pub axes: u32,
-    /// Dense index of the vehicle within the episode.
+    /// Dense index of the vehicle within the episode, or [`ROADSIDE_CARRIER`] and a number.
     pub vehicle: u32,
     /// Azimuths fired.
     pub azimuths: u32,
+    /// Number of the LIDAR among those of the run ([`crate::config::SensorUnit`]).
+    pub sensor: u32,
     /// Zero.
-    pub reserved: [u32; 2],
+    pub reserved: u32,
 }
 
 payload_layout! {

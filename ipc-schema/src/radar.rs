@@ -1,6 +1,6 @@
 //! `radar`: the detections of one radar in a scan.
 //!
-//! One message for each vehicle that carries a radar and each scan. The payload is one [`RadarScan`], then the detections. Their fields are
+//! One message for each radar and each scan. The payload is one [`RadarScan`], then the detections. Their fields are
 //! those of `RadarDetection` of ASAM OSI 3.7.
 
 use bytemuck::{Pod, Zeroable};
@@ -22,7 +22,7 @@ pub struct RadarScan {
     pub attitude_rad: [f64; 3],
     /// Hash of the vehicle's SUMO id.
     pub id_hash: u64,
-    /// Dense index of the vehicle within the episode.
+    /// Dense index of the vehicle within the episode, or [`crate::pointcloud::ROADSIDE_CARRIER`] and a number.
     pub vehicle: u32,
     /// Farthest range, metres.
     pub range_m: f32,
@@ -34,6 +34,10 @@ pub struct RadarScan {
     pub velocity_ambiguity_mps: f32,
     /// Resolution of the azimuth, radians.
     pub azimuth_resolution_rad: f32,
+    /// Number of the radar among those of the run ([`crate::config::SensorUnit`]).
+    pub sensor: u32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// One detection. Azimuth and elevation are those of the sensor's frame: x ahead, y left, z up.

@@ -9,10 +9,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     SCHEMA_VERSION,
-    config::{Config, PreviewFrames},
+    config::{Config, PreviewFrames, SensorUnit},
     field::{RunField, run_fields},
     process::Process,
-    schedule, storage,
+    schedule,
+    sensor::SensorKind,
+    storage,
 };
 
 /// Purpose of a run.
@@ -300,6 +302,8 @@ struct WrittenRun<'a> {
     run: &'a RunFile,
     /// Every field of an observation with its range.
     observation_fields: Vec<RunField>,
+    /// Every sensor that sends messages of its own, with its suite, its name and its mounting.
+    sensor_units: Vec<SensorUnit>,
 }
 
 impl RunFile {
@@ -343,6 +347,7 @@ impl RunFile {
         serde_json::to_string_pretty(&WrittenRun {
             run: self,
             observation_fields: run_fields(&self.config, &self.map),
+            sensor_units: self.config.all_sensor_units(),
         })
     }
 
@@ -435,6 +440,40 @@ impl RunFile {
     pub fn seed(&self) -> u64 {
         let run = &self.config.run;
         schedule::environment_seed(run.seed, run.first_env + self.env_index)
+    }
+
+    /// Most connected vehicles on the road at a time.
+    #[must_use]
+    pub fn most_connected(&self) -> usize {
+        let traffic = &self.config.traffic;
+        let limit = match &self.source {
+            Source::Population { .. } => {
+                let of_stages = self.config.curriculum.stages.iter().map(|stage| stage.cavs);
+                of_stages.fold(traffic.cavs, u32::max)
+            }
+            Source::Scenario { .. } if traffic.max_cavs > 0 => traffic.max_cavs,
+            Source::Scenario { .. } => traffic.max_road_users,
+        };
+        (limit as usize + self.config.heroes()).min(traffic.max_road_users as usize)
+    }
+
+    /// Most messages that the sensors of this kind send at one tick.
+    #[must_use]
+    pub fn messages_per_tick(&self, kind: SensorKind) -> usize {
+        let (config, connected) = (&self.config, self.most_connected());
+        let of_unit = |unit: &SensorUnit| match unit.suite_index.and_then(|index| config.suites.get(index)) {
+            None => (kind.spec().vehicles)(config) as usize,
+            Some(suite) => {
+                let beside = config.roadsides.iter().filter(|roadside| roadside.suite == suite.name);
+                let vehicles = match suite.first {
+                    _ if config.is_roadside_only(suite) => 0,
+                    Some(first) => connected.min(first as usize),
+                    None => connected,
+                };
+                vehicles + beside.count()
+            }
+        };
+        config.sensor_units(kind).iter().map(of_unit).sum()
     }
 
     /// Path of the scene for viewers, as JSON (docs/fanout.md, `map`). `sim-core` writes it before it attaches.

@@ -88,6 +88,12 @@ pub enum NoiseStream {
     WalkBack = 34,
     /// Scale errors of wheel speed and steering angle.
     Scale = 35,
+    /// GNSS receiver, constant error of a unit: east, north, up.
+    GnssUnit = 36,
+    /// IMU, constant biases of a unit: accelerometer, and x of the gyroscope.
+    ImuUnitFront = 37,
+    /// IMU, constant biases of a unit: y and z of the gyroscope.
+    ImuUnitBack = 38,
     /// Blackouts of the GNSS receiver.
     GnssBlackout = 40,
     /// Blackouts of the IMU.
@@ -130,7 +136,7 @@ pub struct SensorSpec {
     pub noise: &'static [NoiseStream],
     /// Random stream of its blackouts.
     pub blackout_noise: NoiseStream,
-    /// Number of vehicles that carry it, those in the first slots; `u32::MAX` = every vehicle.
+    /// Number of vehicles that carry the one of its section, those in the first slots; `u32::MAX` = every vehicle. Suites come beside it.
     pub vehicles: fn(&Config) -> u32,
     /// What its samples depend on.
     pub input: SensorInput,
@@ -177,7 +183,7 @@ pub const SENSORS: [SensorSpec; 7] = [
         label: "GNSS",
         description: "GNSS receiver",
         carriers: SensorCarriers::VehiclesAndPersons,
-        noise: &[NoiseStream::Gnss, NoiseStream::GnssCorrelated],
+        noise: &[NoiseStream::Gnss, NoiseStream::GnssCorrelated, NoiseStream::GnssUnit],
         blackout_noise: NoiseStream::GnssBlackout,
         vehicles: |_| u32::MAX,
         input: SensorInput::Motion,
@@ -201,6 +207,8 @@ pub const SENSORS: [SensorSpec; 7] = [
             NoiseStream::ImuBack,
             NoiseStream::WalkFront,
             NoiseStream::WalkBack,
+            NoiseStream::ImuUnitFront,
+            NoiseStream::ImuUnitBack,
         ],
         blackout_noise: NoiseStream::ImuBlackout,
         vehicles: |_| u32::MAX,
@@ -237,9 +245,9 @@ pub const SENSORS: [SensorSpec; 7] = [
         blackout_noise: NoiseStream::LidarBlackout,
         vehicles: |config| config.lidar.vehicles,
         input: SensorInput::Surroundings,
-        scene: |config| match config.lidar.vehicles {
-            0 => SceneUse::Unused,
-            _ => SceneUse::Rays,
+        scene: |config| match config.carries(SensorKind::Lidar) {
+            true => SceneUse::Rays,
+            false => SceneUse::Unused,
         },
         // It scans at every tick.
         period_s: |config| config.run.tick_s,
@@ -277,9 +285,9 @@ pub const SENSORS: [SensorSpec; 7] = [
         blackout_noise: NoiseStream::CameraBlackout,
         vehicles: |config| config.camera.vehicles,
         input: SensorInput::Surroundings,
-        scene: |config| match config.camera.vehicles {
-            0 => SceneUse::Unused,
-            _ => SceneUse::Images,
+        scene: |config| match config.carries(SensorKind::Camera) {
+            true => SceneUse::Images,
+            false => SceneUse::Unused,
         },
         period_s: |config| config.camera.period_s,
         blackouts: blackouts!(camera),
@@ -297,9 +305,9 @@ pub const SENSORS: [SensorSpec; 7] = [
         blackout_noise: NoiseStream::RadarBlackout,
         vehicles: |config| config.radar.vehicles,
         input: SensorInput::Surroundings,
-        scene: |config| match config.radar.vehicles {
-            0 => SceneUse::Unused,
-            _ => SceneUse::Echoes,
+        scene: |config| match config.carries(SensorKind::Radar) {
+            true => SceneUse::Echoes,
+            false => SceneUse::Unused,
         },
         period_s: |config| config.radar.period_s,
         blackouts: blackouts!(radar),
@@ -324,7 +332,7 @@ pub const ALL_SENSORS: u32 = (1 << SensorKind::COUNT) - 1;
 /// Bits of the sensors that any road user of a run with this configuration carries.
 #[must_use]
 pub fn fitted_sensors(config: &Config) -> u32 {
-    let fitted = SENSORS.iter().filter(|spec| (spec.vehicles)(config) > 0);
+    let fitted = SENSORS.iter().filter(|spec| config.carries(spec.kind));
     fitted.fold(0, |bits, spec| bits | spec.kind.bit())
 }
 
@@ -476,7 +484,9 @@ mod tests {
         // The numbers that every run so far was drawn with: one that changes changes every observation.
         assert_eq!(
             numbers,
-            [1, 2, 3, 4, 5, 6, 7, 32, 33, 34, 35, 40, 41, 42, 43, 44, 45, 46]
+            [
+                1, 2, 3, 4, 5, 6, 7, 32, 33, 34, 35, 36, 37, 38, 40, 41, 42, 43, 44, 45, 46
+            ]
         );
         // A stream has the low eight bits of a word, a part of a sample the others.
         assert!(numbers.iter().all(|number| (1..256).contains(number)));

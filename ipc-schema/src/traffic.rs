@@ -160,6 +160,13 @@ impl VehicleMeta {
         String::from_utf8_lossy(class).into_owned()
     }
 
+    /// SUMO's vehicle type as text ([`TYPE_ID_BYTES`] at most).
+    #[must_use]
+    pub fn type_text(&self) -> String {
+        let name = self.type_id.split(|&byte| byte == 0).next().unwrap_or_default();
+        String::from_utf8_lossy(name).into_owned()
+    }
+
     /// Stores `id`, shortened to [`ID_BYTES`], with the hash of the whole.
     pub fn set_id(&mut self, id: &str) {
         (self.id, self.id_len) = id_text_bytes(id);

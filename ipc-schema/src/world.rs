@@ -26,6 +26,10 @@ pub const AGAINST_TRAFFIC: u32 = 1 << 8;
 /// It is led along its path as if on rails, because no driving would keep it there.
 pub const GUIDED: u32 = 1 << 9;
 
+/// Place of the first bit that names a suite of [`crate::config::Config::suites`]: that of suite *n* is set if class, type, id and share
+/// let the vehicle carry it. Bits of flags are below.
+pub const SUITES_SHIFT: u32 = 16;
+
 /// One road user at the end of a tick.
 ///
 /// World frame: metres in the net's projected coordinates, x east, y north, z up. Body frame: x forward, y left, z up,
@@ -76,7 +80,7 @@ pub struct VehicleState {
     /// SUMO's signal bits.
     pub signals: u32,
     /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`],
-    /// [`RED_LIGHT`], [`AGAINST_TRAFFIC`], [`GUIDED`].
+    /// [`RED_LIGHT`], [`AGAINST_TRAFFIC`], [`GUIDED`], and from [`SUITES_SHIFT`] on the suites that it may carry.
     pub flags: u32,
     /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
     pub reference_offset_m: f32,

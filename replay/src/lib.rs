@@ -18,6 +18,7 @@ use ipc_schema::{
     ports::Publisher,
     process::Process,
     run::Replay,
+    sensor::SensorKind,
 };
 use recorder::file::{
     RecordingError,
@@ -81,10 +82,10 @@ impl Player {
             // It has a publisher of its own.
             Channel::Observation => false,
             Channel::Prediction => !has_trainer,
-            Channel::Pointcloud => membership.run.config.lidar.vehicles > 0,
-            Channel::Image => membership.run.config.camera.vehicles > 0,
+            Channel::Pointcloud => membership.run.config.carries(SensorKind::Lidar),
+            Channel::Image => membership.run.config.carries(SensorKind::Camera),
             Channel::LanePosition => membership.run.config.traffic.lane_positions,
-            Channel::Radar => membership.run.config.radar.vehicles > 0,
+            Channel::Radar => membership.run.config.carries(SensorKind::Radar),
             Channel::Census => membership.run.config.fanout.enabled,
             Channel::TrafficMeta | Channel::World | Channel::Event => true,
         };

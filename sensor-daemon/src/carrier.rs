@@ -4,6 +4,7 @@ use ipc_schema::sensor::SensorKind;
 
 use crate::{
     blackout::BlackoutPhase,
+    mounts::LeverArms,
     observation::fields::SensorReadings,
     sensors::{gnss::GnssState, imu::ImuAxes, speed_steering::SpeedSteeringScales},
 };
@@ -15,7 +16,7 @@ pub struct SensorCarrier {
     pub readings: SensorReadings,
     /// State of the GNSS receiver.
     pub gnss: GnssState,
-    /// Random walk of the IMU's biases so far.
+    /// The IMU's own constant biases, and the random walk of the biases so far.
     pub walk: ImuAxes,
     /// Constant scale factors of its speed and steering angle.
     pub scales: SpeedSteeringScales,
@@ -25,6 +26,12 @@ pub struct SensorCarrier {
     pub sampled: [u32; SensorKind::COUNT],
     /// Sensors that the road user has.
     pub present: u32,
+    /// Those of them that a section of the configuration gives it, rather than a suite.
+    pub own: u32,
+    /// Place of its suite among those of the run.
+    pub suite: Option<usize>,
+    /// Places of its antenna and of its inertial unit; `None` if both are at the centre of the rear axle on the ground.
+    pub arms: Option<Box<LeverArms>>,
     /// Sensors that a command has switched off.
     pub off: u32,
     /// Sensors that have delivered at least once.
@@ -51,6 +58,9 @@ impl SensorCarrier {
             phases: [BlackoutPhase::default(); SensorKind::COUNT],
             sampled: [0; SensorKind::COUNT],
             present,
+            own: present,
+            suite: None,
+            arms: None,
             off: 0,
             known: 0,
             is_seen: false,

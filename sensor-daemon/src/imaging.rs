@@ -1,10 +1,10 @@
-//! Cameras in a run: publishes the images of every vehicle that carries one, and counts and hashes them.
+//! Cameras in a run: publishes the images of every carrier, and counts and hashes them.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, mem::offset_of, sync::Arc};
 
 use ipc_schema::{
     block,
-    config::Config,
+    config::{Config, OWN_SENSOR},
     failure::{Failure, FailureKind},
     header::MessageHeader,
     image::{ImageHead, ImageLayout, ImagePlane, MOST_SEEN, SeenObject},
@@ -13,12 +13,13 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use serde::{Deserialize, Serialize};
-use sim_core::scene::Scene;
 
 use crate::{
+    mounts::DueUnit,
+    roadside::RoadsideCarriers,
     sensing::Sensing,
     sensors::{
-        camera::{CameraModel, CameraParams, CameraScratch, CameraTargets, ImagePlanes},
+        camera::{CameraModel, CameraParams, CameraScratch, CameraTargets, ImagePlanes, SightScene},
         lidar::Targets,
     },
 };
@@ -50,37 +51,53 @@ impl MessageTotals {
 
 /// The cameras of a run.
 pub struct CameraImaging {
-    /// One for each map of the run.
-    cameras: Vec<CameraModel>,
+    /// By number.
+    cameras: BTreeMap<u32, NumberedCamera>,
     targets: Targets,
     seen: CameraTargets,
     scratch: CameraScratch,
     objects: Vec<SeenObject>,
+    due: Vec<DueUnit>,
     publisher: Publisher,
-    planes: u32,
-    range_m: f32,
-    plane_bytes: usize,
     totals: MessageTotals,
 }
 
+/// The cameras of one number.
+struct NumberedCamera {
+    /// One for each map of the run.
+    maps: Vec<CameraModel>,
+    planes: u32,
+    range_m: f32,
+    plane_bytes: usize,
+}
+
 impl CameraImaging {
-    /// Cameras as configured, in the scenes of the run's maps.
+    /// Cameras as configured, in what cameras see of the run's maps.
     #[must_use]
-    pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Self {
-        let params = CameraParams::from(&config.camera);
-        Self {
-            cameras: scenes
+    pub fn new(config: &Config, sights: &[Arc<SightScene>], publisher: Publisher) -> Self {
+        let units = config.sensor_units(SensorKind::Camera);
+        let cameras = units.iter().map(|unit| {
+            let camera = config.with_unit(unit).camera;
+            let params = CameraParams::from(&camera);
+            let maps = sights
                 .iter()
-                .map(|scene| CameraModel::new(&params, config, scene))
-                .collect(),
+                .map(|sight| CameraModel::in_sight(&params, Arc::clone(sight)));
+            let camera = NumberedCamera {
+                maps: maps.collect(),
+                planes: ImagePlane::wanted(&camera),
+                range_m: camera.range_m as f32,
+                plane_bytes: ImagePlane::bytes(&camera),
+            };
+            (unit.sensor, camera)
+        });
+        Self {
+            cameras: cameras.collect(),
             targets: Targets::default(),
             seen: CameraTargets::default(),
             scratch: CameraScratch::default(),
             objects: Vec::new(),
+            due: Vec::new(),
             publisher,
-            planes: ImagePlane::wanted(&config.camera),
-            range_m: config.camera.range_m as f32,
-            plane_bytes: ImagePlane::bytes(&config.camera),
             totals: MessageTotals::default(),
         }
     }
@@ -96,60 +113,86 @@ impl CameraImaging {
         &self.totals
     }
 
-    /// One tick: takes and publishes an image from every vehicle whose camera is due.
+    /// One tick: takes and publishes an image with every camera that is due.
     ///
     /// # Errors
     /// Shared memory fails.
-    pub fn take(&mut self, header: &MessageHeader, states: &[VehicleState], sensing: &Sensing) -> Result<(), Failure> {
-        let carriers: Vec<usize> = sensing.carriers_due(SensorKind::Camera).map(|(_, row)| row).collect();
-        if carriers.is_empty() {
-            return Ok(());
+    pub fn take(
+        &mut self,
+        header: &MessageHeader,
+        states: &[VehicleState],
+        beside: &RoadsideCarriers,
+        sensing: &Sensing,
+    ) -> Result<(), Failure> {
+        let mut due = std::mem::take(&mut self.due);
+        sensing.units_due(SensorKind::Camera, &mut due);
+        beside.add_due(SensorKind::Camera, sensing.now(header).tick, states.len(), &mut due);
+        if !due.is_empty() {
+            let steps: &[SubStep] = &[];
+            self.targets.update(states, steps, 0);
+            self.seen.update(&self.targets);
+            self.targets.add_fixed(beside.states());
         }
-        let steps: &[SubStep] = &[];
-        self.targets.update(states, steps, 0);
-        self.seen.update(&self.targets);
-        for row in carriers {
-            self.take_one(header, states, row)?;
+        for unit in &due {
+            let carrier = states
+                .get(unit.row)
+                .or_else(|| beside.states().get(unit.row - states.len()));
+            if let Some(carrier) = carrier {
+                self.take_one(header, carrier, unit)?;
+            }
         }
+        self.due = due;
         Ok(())
     }
 
-    fn take_one(&mut self, header: &MessageHeader, states: &[VehicleState], row: usize) -> Result<(), Failure> {
-        let camera = &self.cameras[usize::from(header.map).min(self.cameras.len() - 1)];
-        let Some(pose) = camera.pose_on(&self.targets, row) else {
+    fn take_one(&mut self, header: &MessageHeader, carrier: &VehicleState, unit: &DueUnit) -> Result<(), Failure> {
+        let Some(numbered) = self.cameras.get(&unit.sensor) else {
             return Ok(());
         };
-        let layout = ImageLayout::new(MOST_SEEN, self.plane_bytes);
+        let camera = &numbered.maps[usize::from(header.map).min(numbered.maps.len() - 1)];
+        let Some(pose) = camera.pose_on(&self.targets, unit.row) else {
+            return Ok(());
+        };
+        let layout = ImageLayout::new(MOST_SEEN, numbered.plane_bytes);
         let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
         let sections = [layout.head, layout.planes, layout.objects];
         let [head, planes, listed] = block::split_mut(draft.payload_mut(), &sections).map_err(unreadable)?;
         let [width, height] = camera.size();
-        let mut planes_of = split_planes(planes, self.planes, width * height);
+        let mut planes_of = split_planes(planes, numbered.planes, width * height);
         let (seen, scratch) = (&self.seen, &mut self.scratch);
-        camera.take(seen, Some(row), &pose, scratch, &mut planes_of, &mut self.objects);
+        camera.take(seen, Some(unit.row), &pose, scratch, &mut planes_of, &mut self.objects);
         self.objects.truncate(MOST_SEEN);
         let objects: &[u8] = bytemuck::cast_slice(&self.objects);
         listed[..objects.len()].copy_from_slice(objects);
         head.copy_from_slice(bytemuck::bytes_of(&ImageHead {
             position_m: pose.position_m(),
             attitude_rad: pose.attitude_rad(),
-            id_hash: states[row].id_hash,
-            vehicle: states[row].vehicle,
+            id_hash: carrier.id_hash,
+            vehicle: carrier.vehicle,
             width: width as u32,
             height: height as u32,
-            planes: self.planes,
+            planes: numbered.planes,
             focal_px: camera.focal_px() as f32,
-            range_m: self.range_m,
+            range_m: numbered.range_m,
+            sensor: unit.sensor,
+            reserved: 0,
         }));
+        let hashed = hashed_head(head, offset_of!(ImageHead, sensor), unit.sensor);
         self.totals
-            .add(header.tick, self.objects.len(), &[head, planes, objects]);
+            .add(header.tick, self.objects.len(), &[hashed, planes, objects]);
         *draft.header_mut() = MessageHeader {
-            shape: ImageLayout::new(self.objects.len(), self.plane_bytes).shape,
+            shape: ImageLayout::new(self.objects.len(), numbered.plane_bytes).shape,
             ..*header
         };
         draft.send()?;
         Ok(())
     }
+}
+
+/// The part of a head that is hashed. That of a section's sensor ends before its number, which is 0: runs without suites keep the hashes
+/// that they had before there were numbers.
+pub(crate) fn hashed_head(head: &[u8], number_at: usize, sensor: u32) -> &[u8] {
+    if sensor == OWN_SENSOR { &head[..number_at] } else { head }
 }
 
 /// The planes of an image within the bytes of a message.

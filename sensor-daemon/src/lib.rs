@@ -12,12 +12,14 @@ pub mod daemon;
 pub mod delivery;
 pub mod echoing;
 pub mod imaging;
+pub mod mounts;
 pub mod noise;
 pub mod observation;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
 pub mod region;
+pub mod roadside;
 pub mod scanning;
 pub mod sensing;
 pub mod sensors;

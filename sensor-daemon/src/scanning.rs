@@ -1,6 +1,6 @@
-//! LIDARs in a run: publishes the scans of every vehicle that carries one, and passes the nearest objects to the observation.
+//! LIDARs in a run: publishes the scans of every carrier, and passes the nearest objects to the observation.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::{
     block,
@@ -16,6 +16,8 @@ use serde::{Deserialize, Serialize};
 use sim_core::scene::Scene;
 
 use crate::{
+    mounts::DueUnit,
+    roadside::RoadsideCarriers,
     sensing::Sensing,
     sensors::lidar::{LidarModel, ScanScratch, Targets, nearest_objects},
 };
@@ -33,15 +35,23 @@ pub struct ScanTotals {
 
 /// The LIDARs of a run.
 pub struct LidarScanning {
-    /// One for each map of the run.
-    lidars: Vec<LidarModel>,
+    /// By number.
+    lidars: BTreeMap<u32, NumberedLidar>,
     targets: Targets,
     scratch: ScanScratch,
+    due: Vec<DueUnit>,
     publisher: Publisher,
     sub_steps: usize,
     /// The observation has fields of nearest objects.
     shows_objects: bool,
     totals: ScanTotals,
+}
+
+/// The LIDARs of one number.
+struct NumberedLidar {
+    /// One for each map of the run.
+    maps: Vec<LidarModel>,
+    noise_key: u64,
 }
 
 impl LidarScanning {
@@ -50,11 +60,21 @@ impl LidarScanning {
     /// # Errors
     /// A ray table or mesh cannot be used.
     pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Result<Self, Failure> {
-        let lidars = scenes.iter().map(|scene| LidarModel::new(config, scene));
+        let mut lidars = BTreeMap::new();
+        for unit in config.sensor_units(SensorKind::Lidar) {
+            let config = config.with_unit(&unit);
+            let maps = scenes.iter().map(|scene| LidarModel::new(&config, scene));
+            let lidar = NumberedLidar {
+                maps: maps.collect::<Result<_, _>>()?,
+                noise_key: unit.noise_key(),
+            };
+            lidars.insert(unit.sensor, lidar);
+        }
         Ok(Self {
-            lidars: lidars.collect::<Result<_, _>>()?,
+            lidars,
             targets: Targets::default(),
             scratch: ScanScratch::default(),
+            due: Vec::new(),
             publisher,
             sub_steps: config.run.sub_steps as usize,
             shows_objects: config
@@ -77,7 +97,7 @@ impl LidarScanning {
         self.totals
     }
 
-    /// One tick: scans from every vehicle that carries a LIDAR, publishes the points and passes the nearest objects to `sensing`.
+    /// One tick: scans with every LIDAR that is due, publishes the points and passes the nearest objects to `sensing`.
     ///
     /// # Errors
     /// Shared memory fails.
@@ -86,20 +106,32 @@ impl LidarScanning {
         header: &MessageHeader,
         states: &[VehicleState],
         sub_steps: &[SubStep],
+        beside: &RoadsideCarriers,
         sensing: &mut Sensing,
     ) -> Result<(), Failure> {
-        self.targets.update(states, sub_steps, self.sub_steps);
-        let carriers: Vec<(usize, usize)> = sensing.carriers_due(SensorKind::Lidar).collect();
-        for (slot, row) in carriers {
-            if let Some(objects) = self.scan_one(header, row)? {
+        let mut due = std::mem::take(&mut self.due);
+        sensing.units_due(SensorKind::Lidar, &mut due);
+        beside.add_due(SensorKind::Lidar, sensing.now(header).tick, states.len(), &mut due);
+        if !due.is_empty() {
+            self.targets.update(states, sub_steps, self.sub_steps);
+            self.targets.add_fixed(beside.states());
+        }
+        for unit in &due {
+            if let Some(objects) = self.scan_one(header, unit)?
+                && let Some(slot) = unit.slot
+            {
                 sensing.set_objects(slot, objects);
             }
         }
+        self.due = due;
         Ok(())
     }
 
-    fn scan_one(&mut self, header: &MessageHeader, row: usize) -> Result<Option<[[f32; 2]; 4]>, Failure> {
-        let lidar = &self.lidars[usize::from(header.map).min(self.lidars.len() - 1)];
+    fn scan_one(&mut self, header: &MessageHeader, unit: &DueUnit) -> Result<Option<[[f32; 2]; 4]>, Failure> {
+        let Some(NumberedLidar { maps, noise_key }) = self.lidars.get(&unit.sensor) else {
+            return Ok(None);
+        };
+        let lidar = &maps[usize::from(header.map).min(maps.len() - 1)];
         let layout = PointcloudLayout::new(lidar.max_points());
         let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
         let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(unreadable)?;
@@ -107,14 +139,16 @@ impl LidarScanning {
         let mut scan = Scan::default();
         let count = lidar.scan(
             &self.targets,
-            row,
+            unit.row,
             header.tick,
-            header.episode_seed,
+            header.episode_seed ^ noise_key,
             &mut self.scratch,
             &mut scan,
             points,
         );
-        let objects = self.shows_objects.then(|| nearest_objects(&points[..count], lidar));
+        scan.sensor = unit.sensor;
+        let shows_objects = self.shows_objects && unit.is_first;
+        let objects = shows_objects.then(|| nearest_objects(&points[..count], lidar));
         self.totals.scans += 1;
         self.totals.rays += u64::from(scan.rays);
         self.totals.points += count as u64;

@@ -15,6 +15,7 @@ use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
     carrier::SensorCarrier,
+    mounts::DueUnit,
     noise::normals::BATCH,
     noise::{DrawnNormals, NormalDraws},
     observation::fields::{Normaliser, SensorReadings},
@@ -321,11 +322,35 @@ impl Sensing {
         }
     }
 
-    /// Slot and row in the world of each road user whose `sensor` samples at the tick of the last [`Sensing::assign`].
+    /// The sensors of this kind that sample at the tick of the last [`Sensing::assign`]: those of sections and of suites, slot by slot.
+    pub fn units_due(&self, sensor: SensorKind, due: &mut Vec<DueUnit>) {
+        due.clear();
+        let suite = self.suite();
+        for (slot, (row, carrier)) in self.row_of_slot.iter().zip(&self.carriers).enumerate() {
+            let Some(row) = *row else { continue };
+            if !sensor.is_in(carrier.awake()) {
+                continue;
+            }
+            let (step, row, has_own) = (self.slots.rows()[slot].step, row as usize, sensor.is_in(carrier.own));
+            if has_own && suite.is_due(sensor, step) {
+                due.push(DueUnit::own(slot, row));
+            }
+            let mounted = suite.mounted().due(carrier.suite, sensor, step);
+            due.extend(mounted.map(|(number, is_first)| DueUnit {
+                slot: Some(slot),
+                row,
+                sensor: number,
+                is_first: is_first && !has_own,
+            }));
+        }
+    }
+
+    /// Slot and row in the world of each road user whose `sensor`, that of a section, samples at the tick of the last
+    /// [`Sensing::assign`].
     pub fn carriers_due(&self, sensor: SensorKind) -> impl Iterator<Item = (usize, usize)> {
         let slots = self.row_of_slot.iter().zip(&self.carriers).enumerate();
         slots.filter_map(move |(slot, (row, carrier))| match row {
-            Some(row) if sensor.is_in(carrier.awake()) => {
+            Some(row) if sensor.is_in(carrier.awake() & carrier.own) => {
                 let is_due = self.suite().is_due(sensor, self.slots.rows()[slot].step);
                 is_due.then_some((slot, *row as usize))
             }

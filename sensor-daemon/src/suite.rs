@@ -11,6 +11,7 @@ use sim_core::geodesy::{GeodesyError, Projection};
 use crate::{
     blackout::BlackoutSchedule,
     carrier::SensorCarrier,
+    mounts::MountedSuites,
     noise::{DrawnNormals, NormalDraws, normals::NormalBlock},
     observation::fields::SensorReadings,
     sensors::{
@@ -31,13 +32,16 @@ pub struct SensorSuite {
     schedules: [Option<BlackoutSchedule>; SensorKind::COUNT],
     /// Ticks between two samples of each sensor.
     periods: [u32; SensorKind::COUNT],
-    /// Number of vehicles that carry each sensor: those in the first slots.
+    /// Number of vehicles that carry each sensor of a section: those in the first slots.
     vehicles: [u32; SensorKind::COUNT],
+    /// Suites of further sensors.
+    mounted: MountedSuites,
     /// Bits of the sensors whose samples [`crate::surroundings`] takes.
     of_surroundings: u32,
     /// Readings of a carrier whose sensors have not sampled.
     unsensed: SensorReadings,
     tick_s: f64,
+    sub_step_s: f64,
     path: VectorPath,
 }
 
@@ -52,23 +56,22 @@ impl SensorSuite {
         bounds_m: [f64; 4],
         tick_ns: u64,
     ) -> Result<Self, GeodesyError> {
-        // Validated to be whole numbers of ticks.
-        let ticks =
-            |period_s: f64| ((period_s / config.run.tick_s).round() as i64).clamp(1, i64::from(u32::MAX)) as u32;
         Ok(Self {
             gnss: GnssReceiver::new(&config.gnss, projection, bounds_m)?,
             sky: None,
             imu: ImuModel::new(&config.imu, config.imu_samples(), config.run.tick_s),
             speed_steering: SpeedSteeringModel::new(&config.speed_steering, config.vehicle.steering_ratio),
             schedules: schedules(config, tick_ns),
-            periods: SENSORS.map(|spec| ticks((spec.period_s)(config))),
+            periods: SENSORS.map(|spec| config.period_ticks(spec.kind)),
             vehicles: SENSORS.map(|spec| (spec.vehicles)(config)),
+            mounted: MountedSuites::new(config),
             of_surroundings: SENSORS
                 .iter()
                 .filter(|spec| spec.input == SensorInput::Surroundings)
                 .fold(0, |bits, spec| bits | spec.kind.bit()),
             unsensed: SensorReadings::unsensed(config),
             tick_s: config.run.tick_s,
+            sub_step_s: config.run.tick_s / f64::from(config.run.sub_steps),
             path: VectorPath::widest(),
         })
     }
@@ -102,11 +105,16 @@ impl SensorSuite {
         let present = present.fold(0, |bits, kind| bits | kind.bit());
         let mut carrier = SensorCarrier::new(
             present,
-            self.gnss.begin(is_person),
-            ImuModel::begin(),
+            self.gnss.begin(is_person, now.episode_seed, state.id_hash),
+            self.imu.begin(now.episode_seed, state.id_hash),
             self.speed_steering.begin(now.episode_seed, state.id_hash),
             self.unsensed,
         );
+        if !is_person {
+            carrier.suite = self.mounted.suite_of(state.flags, slot);
+            carrier.present |= self.mounted.kinds(carrier.suite);
+            carrier.arms = self.mounted.arms(carrier.suite);
+        }
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {
                 *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
@@ -132,7 +140,20 @@ impl SensorSuite {
         self.imu.plan(draws, now.tick);
     }
 
-    /// True if the sensor samples at this step of its carrier; the first step samples everything.
+    /// The suites of further sensors.
+    #[must_use]
+    pub fn mounted(&self) -> &MountedSuites {
+        &self.mounted
+    }
+
+    /// True if a sensor of this kind of the carrier samples at this step.
+    #[inline]
+    fn is_any_due(&self, carrier: &SensorCarrier, sensor: SensorKind, step: u32) -> bool {
+        let is_own_due = sensor.is_in(carrier.own) && self.is_due(sensor, step);
+        is_own_due || self.mounted.due(carrier.suite, sensor, step).next().is_some()
+    }
+
+    /// True if the sensor of a section samples at this step of its carrier; the first step samples everything.
     #[inline]
     #[must_use]
     pub fn is_due(&self, sensor: SensorKind, step: u32) -> bool {
@@ -166,7 +187,7 @@ impl SensorSuite {
         // Those samples have been taken before.
         if awake & self.of_surroundings != 0 {
             for sensor in SensorKind::ALL {
-                if sensor.is_in(awake & self.of_surroundings) && self.is_due(sensor, step) {
+                if sensor.is_in(awake & self.of_surroundings) && self.is_any_due(carrier, sensor, step) {
                     carrier.record(sensor, step);
                 }
             }
@@ -188,7 +209,11 @@ impl SensorSuite {
             let sky = self.sky.as_ref();
             sky.map_or_else(SkyView::default, |sky| sky.at(x_m, y_m, z_m, time_s))
         };
-        if let Some(fix) = self.gnss.sample(&mut carrier.gnss, motion, is_awake, normals, view) {
+        let arm_m = carrier.arms.as_ref().map_or([0.0; 3], |arms| arms.antenna_m);
+        let fix = self
+            .gnss
+            .sample(&mut carrier.gnss, motion, arm_m, is_awake, normals, view);
+        if let Some(fix) = fix {
             carrier.readings.fix = fix;
             carrier.record(SensorKind::Gnss, motion.step);
         }
@@ -206,7 +231,10 @@ impl SensorSuite {
         if self.is_due(SensorKind::Imu, motion.step) {
             let body = ImuMotion {
                 yaw_rad: motion.state.yaw_rad,
-                rows: motion.rows,
+                rows: match &mut carrier.arms {
+                    Some(arms) => arms.felt(motion.rows, self.sub_step_s),
+                    None => motion.rows,
+                },
             };
             self.imu.sample(self.path, &body, drawn, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
@@ -214,6 +242,8 @@ impl SensorSuite {
                 carrier.record(SensorKind::Imu, motion.step);
                 return;
             }
+        } else if let Some(arms) = &mut carrier.arms {
+            arms.skip(motion.rows);
         }
         out.fill(carrier.readings.imu);
     }

@@ -19,9 +19,10 @@ use sim_core::{
 use crate::{
     echoing::RadarScanning,
     imaging::{CameraImaging, MessageTotals},
+    roadside::RoadsideCarriers,
     scanning::{LidarScanning, ScanTotals},
     sensing::{Sensing, WorldTick},
-    sensors::{sky::SkyMap, ultrasonic::UltrasonicSampling},
+    sensors::{camera::SightScene, sky::SkyMap, ultrasonic::UltrasonicSampling},
 };
 
 /// The sensors of the surroundings of a run, those that its configuration has.
@@ -30,6 +31,7 @@ pub struct Surroundings {
     ultrasonic: Option<UltrasonicSampling>,
     cameras: Option<CameraImaging>,
     radars: Option<RadarScanning>,
+    beside: RoadsideCarriers,
 }
 
 impl Surroundings {
@@ -45,6 +47,7 @@ impl Surroundings {
                 ultrasonic: None,
                 cameras: None,
                 radars: None,
+                beside: RoadsideCarriers::new(&membership.run, &[])?,
             });
         }
         let scenes = Scene::of_every_map(&membership.run)?;
@@ -61,21 +64,34 @@ impl Surroundings {
         }
         let ultrasonic = uses.contains(&SceneUse::Solids);
         let ultrasonic = ultrasonic.then(|| UltrasonicSampling::new(&membership.run.config, &scenes));
+        // Cameras and radars share what they see of a map.
+        let looks = [SceneUse::Images, SceneUse::Echoes]
+            .iter()
+            .any(|scene| uses.contains(scene));
+        let sights: Vec<Arc<SightScene>> = match looks {
+            true => {
+                let seen = scenes.iter();
+                seen.map(|scene| Arc::new(SightScene::new(&membership.run.config, scene)))
+                    .collect()
+            }
+            false => Vec::new(),
+        };
         let mut cameras = None;
         if uses.contains(&SceneUse::Images) {
             let publisher = membership.publisher(Channel::Image)?;
-            cameras = Some(CameraImaging::new(&membership.run.config, &scenes, publisher));
+            cameras = Some(CameraImaging::new(&membership.run.config, &sights, publisher));
         }
         let mut radars = None;
         if uses.contains(&SceneUse::Echoes) {
             let publisher = membership.publisher(Channel::Radar)?;
-            radars = Some(RadarScanning::new(&membership.run.config, &scenes, publisher));
+            radars = Some(RadarScanning::new(&membership.run.config, &sights, publisher));
         }
         Ok(Self {
             lidars,
             ultrasonic,
             cameras,
             radars,
+            beside: RoadsideCarriers::new(&membership.run, &scenes)?,
         })
     }
 
@@ -90,16 +106,16 @@ impl Surroundings {
         sensing: &mut Sensing,
     ) -> Result<(), Failure> {
         if let Some(lidars) = &mut self.lidars {
-            lidars.scan(header, road_users.states, road_users.sub_steps, sensing)?;
+            lidars.scan(header, road_users.states, road_users.sub_steps, &self.beside, sensing)?;
         }
         if let Some(ultrasonic) = &mut self.ultrasonic {
             ultrasonic.sample(header, road_users.states, sensing);
         }
         if let Some(cameras) = &mut self.cameras {
-            cameras.take(header, road_users.states, sensing)?;
+            cameras.take(header, road_users.states, &self.beside, sensing)?;
         }
         if let Some(radars) = &mut self.radars {
-            radars.scan(header, road_users.states, sensing)?;
+            radars.scan(header, road_users.states, &self.beside, sensing)?;
         }
         Ok(())
     }

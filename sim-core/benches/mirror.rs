@@ -64,6 +64,7 @@ fn settings(preview_s: f64) -> MirrorSettings {
         sub_steps: 10,
         ticks_per_step: 1,
         hero_driver: config::HeroDriver::Actions,
+        suites: None,
         wheel_slip: false,
     }
 }

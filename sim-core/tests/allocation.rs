@@ -78,6 +78,7 @@ fn a_tick_allocates_nothing() {
         sub_steps: 10,
         ticks_per_step: 3,
         hero_driver: config::HeroDriver::Actions,
+        suites: None,
         wheel_slip: false,
     };
     let mut mirror = Mirror::new(settings).unwrap();

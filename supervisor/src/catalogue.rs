@@ -63,7 +63,7 @@ impl CatalogueKey {
             ValueKind::Texts | ValueKind::TextsOf(_) => ("texts", Value::Null, Value::Null),
             ValueKind::Fields => ("fields", Value::Null, Value::Null),
             ValueKind::Metric => ("metric", Value::Null, Value::Null),
-            ValueKind::Tables(_) => ("tables", Value::Null, Value::Null),
+            ValueKind::Tables(_) | ValueKind::Suites(_) => ("tables", Value::Null, Value::Null),
         };
         Self {
             path: key.path,

@@ -520,10 +520,13 @@ pub(crate) fn reserve_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let Err(error) = reserve::create(run) else {
         return Ok(());
     };
-    let lidars = match run.config.lidar.vehicles {
+    let mut lidars = match run.config.lidar.vehicles {
         0 => String::new(),
         vehicles => format!(" or `lidar.vehicles` (now {vehicles})"),
     };
+    if !run.config.suites.is_empty() {
+        lidars.push_str(", or give `first` to each `[[suite]]`,");
+    }
     let environments = match run.config.run.envs {
         1 => String::new(),
         envs => format!(" or `run.envs` (now {envs})"),

@@ -1,12 +1,15 @@
-//! The topics `pointcloud/<id>`: a key for each vehicle with a LIDAR, published while a viewer subscribes to it.
+//! The topics `pointcloud/<id>`: a key for each LIDAR, published while a viewer subscribes to it. That of a suite's sensor is
+//! `pointcloud/<id>@<sensor>`; a carrier beside the road has its name for an id.
 
 use std::{collections::BTreeMap, time::Duration};
 
 use bytemuck::pod_read_unaligned;
 use ipc_schema::{
+    config::OWN_SENSOR,
     membership::{MembershipError, RunMembership},
-    pointcloud::Scan,
+    pointcloud::{ROADSIDE_CARRIER, Scan},
     ports::Message,
+    sensor::SensorKind,
     services::Channel,
 };
 use zenoh::bytes::ZBytes;
@@ -26,7 +29,7 @@ const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
 /// A vehicle without a scan for this long has left.
 const VEHICLE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The scans of one vehicle.
+/// The scans of one LIDAR.
 struct ScanStream {
     key_publisher: KeyPublisher,
     budget: RateBudget,
@@ -40,8 +43,12 @@ struct ScanStream {
 pub struct ScanTopics {
     watcher: ChannelWatcher,
     rate_hz: f64,
-    /// By the hash of the vehicle's id.
-    streams: BTreeMap<u64, ScanStream>,
+    /// By the hash of the carrier's id and the number of the LIDAR.
+    streams: BTreeMap<(u64, u32), ScanStream>,
+    /// Names of the LIDARs of suites by their numbers.
+    names: BTreeMap<u32, String>,
+    /// Names of the carriers beside the road, in the order of their numbers.
+    roadsides: Vec<String>,
 }
 
 impl ScanTopics {
@@ -51,10 +58,17 @@ impl ScanTopics {
     /// The service cannot be opened.
     pub fn open(membership: &mut RunMembership) -> Result<Option<Self>, MembershipError> {
         let rate_hz = membership.run.config.fanout.pointcloud_hz;
-        if membership.run.config.lidar.vehicles == 0 || rate_hz <= 0.0 {
+        let config = &membership.run.config;
+        if !config.carries(SensorKind::Lidar) || rate_hz <= 0.0 {
             return Ok(None);
         }
+        let units = config.sensor_units(SensorKind::Lidar);
+        let of_suites = units.into_iter().filter(|unit| unit.sensor != OWN_SENSOR);
+        let names = of_suites.map(|unit| (unit.sensor, unit.name)).collect();
+        let roadsides = config.roadsides.iter().map(|roadside| roadside.name.clone()).collect();
         Ok(Some(Self {
+            names,
+            roadsides,
             watcher: ChannelWatcher::open(membership, Channel::Pointcloud)?,
             rate_hz,
             streams: BTreeMap::new(),
@@ -94,6 +108,21 @@ impl ScanTopics {
         Ok(())
     }
 
+    /// The name of a LIDAR in its topic; `None` as long as the id of its carrier is not known.
+    fn name(&self, directory: &RoadUserDirectory, id_hash: u64, vehicle: u32, sensor: u32) -> Option<String> {
+        let id = match vehicle & ROADSIDE_CARRIER {
+            0 => directory
+                .vehicle(vehicle)
+                .filter(|meta| meta.id_hash == id_hash)?
+                .id_text(),
+            _ => self.roadsides.get((vehicle & !ROADSIDE_CARRIER) as usize)?.clone(),
+        };
+        Some(match self.names.get(&sensor) {
+            Some(name) => format!("{id}@{name}"),
+            None => id,
+        })
+    }
+
     /// Publishes one scan if it is due; returns its length, bytes.
     fn publish_scan(
         &mut self,
@@ -109,22 +138,27 @@ impl ScanTopics {
             counters.refused_messages += 1;
             return Ok(0);
         };
-        let Scan { id_hash, vehicle, .. } = pod_read_unaligned(scan);
-        if !self.streams.contains_key(&id_hash) {
-            let Some(meta) = directory.vehicle(vehicle).filter(|meta| meta.id_hash == id_hash) else {
+        let Scan {
+            id_hash,
+            vehicle,
+            sensor,
+            ..
+        } = pod_read_unaligned(scan);
+        if !self.streams.contains_key(&(id_hash, sensor)) {
+            let Some(name) = self.name(directory, id_hash, vehicle, sensor) else {
                 counters.unnamed_scans += 1;
                 return Ok(0);
             };
             let stream = ScanStream {
-                key_publisher: publisher.declare_scan(&meta.id_text())?,
+                key_publisher: publisher.declare_scan(&name)?,
                 budget: RateBudget::new(self.rate_hz),
                 has_subscriber: false,
                 ask_at: Duration::ZERO,
                 last_scan_at: now,
             };
-            self.streams.insert(id_hash, stream);
+            self.streams.insert((id_hash, sensor), stream);
         }
-        let Some(stream) = self.streams.get_mut(&id_hash) else {
+        let Some(stream) = self.streams.get_mut(&(id_hash, sensor)) else {
             return Ok(0);
         };
         // Is there a subscriber, and is a scan due?

@@ -25,6 +25,10 @@ pub struct GnssConfig {
     pub correlated_std_m: [f64; 3],
     /// Its correlation time, seconds.
     pub correlation_time_s: f64,
+    /// Standard deviation over receivers of a constant error east, north and up, metres: each receiver has its own.
+    pub unit_bias_std_m: [f64; 3],
+    /// Where a vehicle's antenna is: x, y, z from the centre of the rear axle on the ground, metres.
+    pub mount: [f64; 3],
     /// Buildings block satellites: fewer, worse, reflected.
     pub sky_view: bool,
     /// Pedestrians carry a receiver (a smartphone), and so a slot in the observation.
@@ -41,7 +45,12 @@ impl GnssConfig {
     /// Multiplies random errors and biases by `factor`.
     pub(crate) fn scale_noise(&mut self, factor: f64) {
         let angles = [&mut self.noise_std_deg, &mut self.bias_deg];
-        let lengths = [&mut self.noise_std_m, &mut self.bias_m, &mut self.correlated_std_m];
+        let lengths = [
+            &mut self.noise_std_m,
+            &mut self.bias_m,
+            &mut self.correlated_std_m,
+            &mut self.unit_bias_std_m,
+        ];
         angles.into_iter().flatten().for_each(|value| *value *= factor);
         lengths.into_iter().flatten().for_each(|value| *value *= factor);
     }
@@ -67,6 +76,12 @@ pub struct ImuConfig {
     pub period_s: f64,
     /// Frame and gravity.
     pub convention: ImuConvention,
+    /// Where a vehicle's unit is: x, y, z from the centre of the rear axle on the ground, metres.
+    pub mount: [f64; 3],
+    /// Standard deviation over units of a constant bias of the accelerometer by axis, m/s²: each unit has its own.
+    pub accel_unit_bias_std_mps2: [f64; 3],
+    /// Standard deviation over units of a constant bias of the gyroscope by axis, rad/s: each unit has its own.
+    pub gyro_unit_bias_std_radps: [f64; 3],
     /// White noise of a sample, standard deviation by axis, m/s²; beside the density.
     pub accel_noise_std_mps2: [f64; 3],
     /// White noise by axis as a density (velocity random walk), m/s²/√Hz.
@@ -109,6 +124,8 @@ impl ImuConfig {
             &mut self.accel_noise_density,
             &mut self.accel_bias_mps2,
             &mut self.accel_bias_walk,
+            &mut self.accel_unit_bias_std_mps2,
+            &mut self.gyro_unit_bias_std_radps,
             &mut self.gyro_noise_std_radps,
             &mut self.gyro_noise_density,
             &mut self.gyro_bias_radps,

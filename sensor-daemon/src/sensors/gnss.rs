@@ -1,13 +1,14 @@
 //! GNSS receiver: white noise, correlated noise and bias east, north and up, in degrees or metres, and the position with these errors.
 
-use ipc_schema::{config::GnssConfig as Params, sensor::NoiseStream};
+use ipc_schema::{config::GnssConfig as Params, sensor::NoiseStream, world::VehicleState};
 use sim_core::geodesy::{
     GeodesyError, NetPosition, Projection,
     displacement::{DisplacementMap, GroundArc},
 };
 
 use crate::{
-    noise::{DrawnNormals, NormalDraws, normals::NormalBlock},
+    noise::{DrawnNormals, NormalDraws, RandomStream, normals::NormalBlock},
+    sensors::lidar::sensor::{rotation, turned},
     tick::TickMotion,
 };
 
@@ -128,6 +129,8 @@ pub struct GnssReceiver {
     correlated_m: [f64; 3],
     bias: GroundArc,
     bias_m: [f64; 3],
+    /// Standard deviation over receivers of a constant error, metres.
+    unit_bias_std_m: [f64; 3],
     /// Factor on the correlated error after a period, and standard deviation of the noise added to it (unit variance).
     decay: [f32; 2],
     /// Variance of the horizontal distance from white and correlated noise, and square of the horizontal bias, m².
@@ -141,6 +144,8 @@ pub struct GnssReceiver {
 pub struct GnssState {
     /// Correlated error, unit variance: east, north, up.
     pub correlated: [f32; 3],
+    /// Constant error of this receiver east, north and up, metres.
+    pub unit_bias_m: [f64; 3],
     /// Factor on all errors but reflections.
     pub factor: f64,
     /// The receiver had enough satellites at its last sample.
@@ -154,6 +159,8 @@ pub struct GnssErrors<'a> {
     pub white: &'a NormalBlock,
     /// State of the correlated error, unit variance: east, north, up.
     pub correlated: &'a [f32; 3],
+    /// Constant error of this receiver east, north and up, metres.
+    pub unit_bias_m: &'a [f64; 3],
     /// Effect of the sky.
     pub view: &'a SkyView,
     /// Factor on all errors but reflections.
@@ -192,10 +199,11 @@ impl GnssReceiver {
             correlated_m,
             bias,
             bias_m: params.bias_m,
+            unit_bias_std_m: params.unit_bias_std_m,
             pedestrian_factor: params.pedestrian_noise_factor,
             decay: [phi as f32, (1.0 - phi * phi).sqrt() as f32],
             horizontal_m2: [
-                horizontal(&white_m) + horizontal(&correlated_m),
+                horizontal(&white_m) + horizontal(&correlated_m) + horizontal(&params.unit_bias_std_m),
                 bias_east_m * bias_east_m + bias_north_m * bias_north_m,
             ],
         })
@@ -219,21 +227,33 @@ impl GnssReceiver {
 
     /// State of the receiver of a road user that begins a trajectory.
     #[must_use]
-    pub fn begin(&self, is_person: bool) -> GnssState {
+    pub fn begin(&self, is_person: bool, episode_seed: u64, id_hash: u64) -> GnssState {
+        let mut unit_bias_m = [0.0; 3];
+        if self.unit_bias_std_m != [0.0; 3] {
+            let stream = RandomStream {
+                episode_seed,
+                id_hash,
+                sensor: NoiseStream::GnssUnit,
+            };
+            let normals = stream.normals(0);
+            unit_bias_m = [0, 1, 2].map(|axis: usize| self.unit_bias_std_m[axis] * f64::from(normals[axis]));
+        }
         GnssState {
             correlated: [0.0; 3],
+            unit_bias_m,
             factor: if is_person { self.pedestrian_factor } else { 1.0 },
             has_fix: true,
         }
     }
 
-    /// The fix at the end of the tick; `None` while the receiver is not awake or has too few satellites. The correlated error continues
+    /// The fix of an antenna at `arm_m` (x, y, z from the centre of the rear axle) at the end of the tick; `None` while the receiver is not awake or has too few satellites. The correlated error continues
     /// to evolve meanwhile.
     #[inline]
     pub fn sample(
         &self,
         state: &mut GnssState,
         motion: &TickMotion,
+        arm_m: [f64; 3],
         is_awake: bool,
         [white, fresh]: [&NormalBlock; 2],
         view: impl FnOnce([f64; 3]) -> SkyView,
@@ -246,7 +266,7 @@ impl GnssReceiver {
         if !is_awake {
             return None;
         }
-        let place_m = [motion.state.x_m, motion.state.y_m, motion.state.z_m];
+        let place_m = antenna_m(motion.state, arm_m);
         let view = view(place_m);
         state.has_fix = view.has_fix;
         view.has_fix.then(|| {
@@ -255,6 +275,7 @@ impl GnssReceiver {
                 &GnssErrors {
                     white,
                     correlated: &state.correlated,
+                    unit_bias_m: &state.unit_bias_m,
                     view: &view,
                     factor: state.factor,
                 },
@@ -295,7 +316,7 @@ impl GnssReceiver {
         let error_m = [0, 1, 2].map(|axis: usize| {
             let white = self.white_m[axis] * f64::from(errors.white[axis]);
             let correlated = self.correlated_m[axis] * f64::from(errors.correlated[axis]);
-            noisy * (white + correlated) + factor * self.bias_m[axis] + view.offset_m[axis]
+            noisy * (white + correlated) + factor * (self.bias_m[axis] + errors.unit_bias_m[axis]) + view.offset_m[axis]
         });
         let arc = self.ground.arc(y_m, [error_m[0], error_m[1]]);
         let displaced = self.map.displaced(
@@ -317,6 +338,18 @@ impl GnssReceiver {
             satellites: view.satellites,
         }
     }
+}
+
+/// Place of the antenna of a vehicle in this state.
+#[inline(always)]
+fn antenna_m(state: &VehicleState, arm_m: [f64; 3]) -> [f64; 3] {
+    let origin_m = [state.x_m, state.y_m, state.z_m];
+    if arm_m == [0.0; 3] {
+        return origin_m;
+    }
+    let world_from_body = rotation([state.roll_rad.into(), state.pitch_rad.into(), state.yaw_rad]);
+    let arm = turned(&world_from_body, arm_m);
+    std::array::from_fn(|axis| origin_m[axis] + arm[axis])
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ use ipc_schema::{
 
 use crate::{
     noise::normals::{BATCH, cos_sin},
-    noise::{DrawnNormals, NormalDraws},
+    noise::{DrawnNormals, NormalDraws, RandomStream},
     wide::{VectorPath, VectorWork},
 };
 
@@ -52,6 +52,10 @@ pub struct ImuModel {
     is_noisy: bool,
     /// True if any bias walks.
     is_walking: bool,
+    /// Standard deviation over units of a constant bias of each axis.
+    unit_bias_std: ImuAxes,
+    /// True if any axis has one.
+    has_unit_bias: bool,
 }
 
 /// Heading of a vehicle at the end of a tick, and its motion during the tick.
@@ -103,6 +107,11 @@ impl ImuModel {
             0.0,
         );
         let resolution = axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0);
+        let [unit_bias_std, _]: [ImuAxes; 2] = bytemuck::must_cast(axes(
+            params.accel_unit_bias_std_mps2,
+            params.gyro_unit_bias_std_radps,
+            0.0,
+        ));
         let any = |axes: &Pair| axes.iter().any(|std| *std > 0.0);
         Self {
             samples: samples.max(1),
@@ -125,6 +134,8 @@ impl ImuModel {
             is_stepped: any(&resolution),
             is_noisy: any(&white),
             is_walking: any(&walk),
+            has_unit_bias: unit_bias_std.iter().any(|std| *std > 0.0),
+            unit_bias_std,
         }
     }
 
@@ -144,13 +155,25 @@ impl ImuModel {
         }
     }
 
-    /// Random walk of the biases of a road user that begins a trajectory.
+    /// Biases of the unit of a road user that begins a trajectory: its constant ones, before any walk.
     #[must_use]
-    pub fn begin() -> ImuAxes {
-        [0.0; 8]
+    pub fn begin(&self, episode_seed: u64, id_hash: u64) -> ImuAxes {
+        if !self.has_unit_bias {
+            return [0.0; 8];
+        }
+        let normals = |sensor: NoiseStream| {
+            let stream = RandomStream {
+                episode_seed,
+                id_hash,
+                sensor,
+            };
+            stream.normals(0)
+        };
+        let halves = [normals(NoiseStream::ImuUnitFront), normals(NoiseStream::ImuUnitBack)];
+        std::array::from_fn(|axis| self.unit_bias_std[axis] * halves[axis / 4][axis % 4])
     }
 
-    /// Writes the samples of a tick to `out`, oldest first, with the planned numbers; `walk` is the random walk of the biases so far.
+    /// Writes the samples of a tick to `out`, oldest first, with the planned numbers; `walk` holds the biases of the unit so far.
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates, with the gravity half-way; the heading is that at
     /// its end.
@@ -225,6 +248,10 @@ impl VectorWork for Samples<'_> {
             unit.add_errors(white, 2 * first, values);
             if unit.is_walking {
                 unit.walk(drift, 2 * first, self.walk, values);
+            } else if unit.has_unit_bias {
+                for (i, value) in values.iter_mut().flatten().enumerate() {
+                    *value += self.walk[i % 8];
+                }
             }
             unit.quantise(values);
             for (i, out) in some.iter_mut().enumerate() {

@@ -26,6 +26,7 @@ pub mod resynchronisation;
 pub mod road_user;
 pub mod settings;
 pub mod statistics;
+pub mod suites;
 pub mod tracking;
 pub mod window;
 
@@ -232,7 +233,7 @@ impl Mirror {
             return Err(MirrorError::TooMany { vehicle });
         }
         self.dismiss(vehicle);
-        let road_user = RoadUser::new(meta, &mut self.catalogue, self.settings.hero_driver);
+        let road_user = RoadUser::new(meta, &mut self.catalogue, &self.settings);
         if self.settings.preview().is_some() {
             let known = self.limits.len() as u32;
             let more = (known..=road_user.model()).map(|model| path_limits(self.catalogue.at(model)));

@@ -71,6 +71,8 @@ struct GuidedVehicle {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoadUser {
     id_hash: u64,
+    /// Suites of sensors that it may carry, as flags.
+    suites: u32,
     /// Index of its model in the [`ModelCatalogue`].
     model: u32,
     dimensions: VehicleDimensions,
@@ -97,7 +99,7 @@ pub struct RoadUser {
 impl RoadUser {
     /// A road user that SUMO has announced.
     #[must_use]
-    pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue, driver: HeroDriver) -> Self {
+    pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue, settings: &MirrorSettings) -> Self {
         let model = catalogue.index_for(meta);
         let SizedModel {
             dimensions,
@@ -106,7 +108,7 @@ impl RoadUser {
         } = *catalogue.at(model);
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
-        } else if meta.kind == Kind::Hero as u32 && driver == HeroDriver::Actions {
+        } else if meta.kind == Kind::Hero as u32 && settings.hero_driver == HeroDriver::Actions {
             Mover::Hero(Hero::default())
         } else {
             Mover::Vehicle {
@@ -116,6 +118,7 @@ impl RoadUser {
         };
         Self {
             id_hash: meta.id_hash,
+            suites: settings.suites.as_ref().map_or(0, |rules| rules.flags_of(meta)),
             model,
             dimensions,
             steering_ratio: match mover {
@@ -489,7 +492,8 @@ impl RoadUser {
         out: &mut VehicleState,
     ) -> Option<Resynchronisation> {
         let appeared = std::mem::take(&mut self.new);
-        out.flags = if appeared { APPEARED } else { 0 } | if set.is_some() { RESYNCHRONISED } else { 0 };
+        out.flags = self.suites;
+        out.flags |= if appeared { APPEARED } else { 0 } | if set.is_some() { RESYNCHRONISED } else { 0 };
         set.filter(|_| !appeared).map(|cause| Resynchronisation {
             vehicle: out.vehicle,
             cause,

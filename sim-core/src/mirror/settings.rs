@@ -6,6 +6,7 @@ use ipc_schema::{
     run::RunFile,
 };
 
+use super::suites::SuiteRules;
 use crate::models::{catalogue::ModelCatalogue, parameters::ParameterError};
 
 /// Times of a run and limits of its vehicles.
@@ -23,6 +24,8 @@ pub struct MirrorSettings {
     pub ticks_per_step: u32,
     /// What moves the heroes.
     pub hero_driver: config::HeroDriver,
+    /// The suites of sensors, if any, for [`ipc_schema::world::SUITES_SHIFT`].
+    pub suites: Option<SuiteRules>,
     /// An odometer counts the turns of wheels that slip: the world says by how much.
     pub wheel_slip: bool,
 }
@@ -64,6 +67,7 @@ impl MirrorSettings {
             sub_steps: run.config.run.sub_steps,
             ticks_per_step: u32::try_from(run.ticks_per_frame()).unwrap_or(u32::MAX),
             hero_driver: run.config.task.driver,
+            suites: SuiteRules::of_run(run),
             wheel_slip: run.config.speed_steering.wheel_slip,
         }
     }

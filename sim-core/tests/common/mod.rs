@@ -25,6 +25,7 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
         sub_steps,
         ticks_per_step,
         hero_driver: config::HeroDriver::Actions,
+        suites: None,
         wheel_slip: false,
     }
 }

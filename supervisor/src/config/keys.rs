@@ -1,7 +1,7 @@
 //! The table of configuration keys: name, kind, unit, range, meaning. Checks, `--set` and `configs/README.md` derive from it.
 
 use ipc_schema::{
-    config::LidarPattern,
+    config::{KEYS_OF_A_KIND, LidarPattern},
     field::{FIELD_PRESETS, FIELDS},
     metric::PolicyMetric,
 };
@@ -66,6 +66,8 @@ pub enum ValueKind {
     },
     /// A list of tables with these keys.
     Tables(&'static [ConfigKey]),
+    /// A list of tables with these keys, or a ready-made suite by name.
+    Suites(&'static [ConfigKey]),
 }
 
 /// One key.
@@ -142,6 +144,57 @@ pub const STAGE_KEYS: &[ConfigKey] = &[
     optional("curriculum.stages.until_value", "", -1e9, 1e9, "The value that `until_metric` must reach, in the metric's unit: at most this for an error, at least this for progress."),
     ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "The stage ends after this many lessons, if not before. Without a deviation, a metric or a number of lessons it lasts to the end of training.") },
 ];
+
+/// Keys of a suite.
+#[rustfmt::skip]
+pub const SUITE_KEYS: &[ConfigKey] = &[
+    ConfigKey { optional: true, ..other("suite.preset", ValueKind::TextOf(TextForm::Suite), "Ready-made suite whose sensors it has; those of `suite.sensor` come beside them.") },
+    ConfigKey { optional: true, ..other("suite.name", ValueKind::Text, "Name of the suite in messages and for `[[roadside]]`. Unset = that of `suite.preset`.") },
+    ConfigKey { optional: true, ..other("suite.classes", ValueKind::TextsOf(TextForm::VehicleClass), "SUMO's vehicle classes of its carriers. Unset = every class.") },
+    ConfigKey { optional: true, ..other("suite.types", ValueKind::Texts, "SUMO's vehicle types of its carriers (the first 32 bytes of a name count). Unset = every type.") },
+    ConfigKey { optional: true, ..other("suite.ids", ValueKind::Texts, "SUMO ids of its carriers; `*` stands for any text. Unset = every id.") },
+    optional("suite.share", "", 0.0, 1.0, "Share of the connected vehicles with these classes, types and ids that carry it, by a hash of `run.seed` and the id. Unset = 1."),
+    ConfigKey { optional: true, ..integer("suite.first", "slots", 0, 100_000, "Of these vehicles, those in the first slots of the observation, this many. Unset = all slots.") },
+    ConfigKey { optional: true, ..other("suite.sensor", ValueKind::Tables(SUITE_SENSOR_KEYS), "Its sensors, each a `[[suite.sensor]]`.") },
+];
+
+/// Keys of a sensor of a suite beside those of its section.
+#[rustfmt::skip]
+pub const SUITE_SENSOR_KEYS: &[ConfigKey] = &[
+    other("suite.sensor.kind", ValueKind::Choice(&["gnss", "imu", "lidar", "camera", "radar"]), "What it is. Every other key of its section, such as `mount` and `width`, may follow and replaces the section's value for this sensor (\"gnss\" and \"imu\": `mount` alone)."),
+    other("suite.sensor.name", ValueKind::Text, "Its name, unique in the suite."),
+    ConfigKey { optional: true, ..integer("suite.sensor.period_ticks", "ticks", 1, 1_000_000, "Ticks between two samples. Unset = its `period_s`, or that of its section; a LIDAR: 1.") },
+];
+
+/// Keys of a carrier beside the road.
+#[rustfmt::skip]
+pub const ROADSIDE_KEYS: &[ConfigKey] = &[
+    other("roadside.name", ValueKind::Text, "Its name in messages."),
+    other("roadside.suite", ValueKind::Text, "Name of the suite that it carries. Heights of mounts count from its foot."),
+    optional("roadside.x_m", "m", -1e7, 1e7, "Place in the world frame; with `y_m`."),
+    optional("roadside.y_m", "m", -1e7, 1e7, "Place in the world frame; with `x_m`."),
+    optional("roadside.longitude_deg", "deg", -180.0, 180.0, "Place; with `latitude_deg`, in the place of `x_m` and `y_m`."),
+    optional("roadside.latitude_deg", "deg", -89.9, 89.9, "Place; with `longitude_deg`."),
+    optional("roadside.z_m", "m", -10_000.0, 10_000.0, "Height of its foot. Unset = on the ground."),
+    optional("roadside.yaw_deg", "deg", -360.0, 360.0, "Direction of its x axis, counter-clockwise from east. Unset = 0."),
+];
+
+/// Keys of entries of lists of tables.
+const ENTRY_KEYS: [&[ConfigKey]; 4] = [STAGE_KEYS, SUITE_KEYS, SUITE_SENSOR_KEYS, ROADSIDE_KEYS];
+
+/// Path of the sensors of a suite.
+pub const SUITE_SENSORS: &str = "suite.sensor";
+
+/// The key that a sensor of a suite of this kind takes from its section under this name.
+#[must_use]
+pub fn of_section(kind: &str, name: &str) -> Option<&'static ConfigKey> {
+    let is_taken = match kind {
+        "gnss" | "imu" => name == "mount",
+        _ => !KEYS_OF_A_KIND.contains(&name),
+    };
+    let mut keys = KEYS.iter();
+    keys.find(|key| is_taken && key.path.split_once('.') == Some((kind, name)))
+}
 
 /// Former names of keys, with the names that they have now.
 const RENAMED_KEYS: &[(&str, &str)] = &[
@@ -241,6 +294,8 @@ pub const KEYS: &[ConfigKey] = &[
     floats("gnss.bias_deg", "deg", 2, -1.0, 1.0, "Bias of latitude and longitude, degrees of arc on the ground."),
     floats("gnss.noise_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation east, north and up, in addition to `gnss.noise_std_deg`."),
     floats("gnss.bias_m", "m", 3, -10_000.0, 10_000.0, "Bias east, north and up, in addition to `gnss.bias_deg`."),
+    floats("gnss.unit_bias_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation over receivers of a constant error east, north and up: each receiver has its own."),
+    floats("gnss.mount", "m", 3, -100.0, 100.0, "Place of a vehicle's antenna: x, y, z from the centre of the rear axle on the ground. The fix is that of the antenna, the truth that of the rear axle."),
     floats("gnss.correlated_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation of the slow error (first-order Gauss–Markov) east, north and up."),
     float("gnss.correlation_time_s", "s", 0.001, 1e6, "Time in which the correlation of the slow error falls to 1/e."),
     other("gnss.sky_view", ValueKind::Flag, "Buildings block satellites: fewer of them, a worse fix, reflections off walls."),
@@ -250,6 +305,9 @@ pub const KEYS: &[ConfigKey] = &[
     span("gnss.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
     float("imu.period_s", "s", 0.00001, 100.0, "Time between samples: a whole number of sub-steps; all samples of a tick are delivered."),
     other("imu.convention", ValueKind::Choice(&["kinematic", "specific_force", "carla"]), "\"kinematic\": no gravity; \"specific_force\": at rest 9.80665 m/s² upwards; \"carla\": the same in CARLA's left-handed frame (y right)."),
+    floats("imu.mount", "m", 3, -100.0, 100.0, "Place of a vehicle's unit: x, y, z from the centre of the rear axle on the ground. Away from it the accelerometer also feels the turning of the vehicle."),
+    floats("imu.accel_unit_bias_std_mps2", "m/s²", 3, 0.0, 100.0, "Standard deviation over units of a constant bias of the accelerometer by axis: each unit has its own."),
+    floats("imu.gyro_unit_bias_std_radps", "rad/s", 3, 0.0, 10.0, "Standard deviation over units of a constant bias of the gyroscope by axis: each unit has its own."),
     floats("imu.accel_noise_std_mps2", "m/s²", 3, 0.0, 100.0, "White noise of an accelerometer sample, standard deviation by axis; in addition to the density."),
     floats("imu.accel_noise_density", "m/s²/√Hz", 3, 0.0, 100.0, "White noise of the accelerometer by axis as a density (velocity random walk)."),
     floats("imu.accel_bias_mps2", "m/s²", 3, -100.0, 100.0, "Constant bias of the accelerometer by axis."),
@@ -343,6 +401,8 @@ pub const KEYS: &[ConfigKey] = &[
     float("radar.azimuth_resolution_deg", "deg", 0.1, 30.0, "Resolution of the azimuth."),
     span("radar.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("radar.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
+    ConfigKey { optional: true, ..other("suite", ValueKind::Suites(SUITE_KEYS), "Named sets of mounted sensors, each a `[[suite]]`. A connected vehicle carries the first one whose rule it satisfies, beside the sensors of the sections (docs/suites.md).") },
+    ConfigKey { optional: true, ..other("roadside", ValueKind::Tables(ROADSIDE_KEYS), "Carriers of a suite that stand beside the road, each a `[[roadside]]`. A suite without classes, types, ids, share and first that one of them carries is carried by no vehicle.") },
     float("v2x.share", "", 0.0, 1.0, "Share of the connected road users that have a radio; 0 = no messages and no process `v2x`."),
     other("v2x.awareness", ValueKind::Choice(&["cam", "bsm"]), "Message by which vehicles make themselves known: ETSI's CAM, or SAE's BSM (core data) every 0.1 s."),
     other("v2x.denm", ValueKind::Flag, "Vehicles warn of their emergency braking (DENM)."),
@@ -431,10 +491,15 @@ pub const KEYS: &[ConfigKey] = &[
     other("record.on_death", ValueKind::Choice(&["continue", "end_run"]), "After its death `recorder` starts again and records the rest into another file (\"continue\"), or the run ends (\"end_run\")."),
 ];
 
+/// All keys, those of entries of lists of tables last.
+fn all() -> impl Iterator<Item = &'static ConfigKey> {
+    KEYS.iter().chain(ENTRY_KEYS.into_iter().flatten())
+}
+
 /// The key of this dotted path.
 #[must_use]
 pub fn find(path: &str) -> Option<&'static ConfigKey> {
-    KEYS.iter().chain(STAGE_KEYS).find(|key| key.path == path)
+    all().find(|key| key.path == path)
 }
 
 /// Keys of earlier versions, and the keys that replaced them.
@@ -450,8 +515,7 @@ pub fn nearest(path: &str) -> Option<&'static str> {
         return Some(now);
     }
     let last = |p: &str| p.rsplit('.').next().unwrap_or_default().to_owned();
-    KEYS.iter()
-        .chain(STAGE_KEYS)
+    all()
         .map(|key| {
             let whole = strsim::jaro_winkler(path, key.path);
             let leaf = strsim::jaro_winkler(&last(path), &last(key.path));
@@ -496,6 +560,11 @@ impl ConfigKey {
             ValueKind::Integers { min, max } => format!("list of {min} … {max}"),
             ValueKind::Tables(keys) => format!(
                 "list of tables with {}",
+                keys.iter().map(|key| key.leaf()).collect::<Vec<_>>().join(", ")
+            ),
+            ValueKind::Suites(keys) => format!(
+                "{}, or a list of tables with {}",
+                TextForm::Suite.allowed(),
                 keys.iter().map(|key| key.leaf()).collect::<Vec<_>>().join(", ")
             ),
         }

@@ -17,6 +17,8 @@ use super::{
     error::ConfigError,
     keys::{self, ConfigKey, ValueKind},
     span::{NamedText, SourceSpan},
+    suites,
+    text_form::TextForm,
 };
 
 /// A checked value and where it was set.
@@ -64,8 +66,12 @@ pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> 
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
     // A key that takes a word takes every word as text, also "nan" and "true", which mean something else in TOML.
-    let takes_a_word = keys::find(key)
-        .is_some_and(|key| matches!(key.kind, ValueKind::Choice(_) | ValueKind::Text | ValueKind::TextOf(_)));
+    let takes_a_word = keys::find(key).is_some_and(|key| {
+        matches!(
+            key.kind,
+            ValueKind::Choice(_) | ValueKind::Text | ValueKind::TextOf(_) | ValueKind::Suites(_)
+        )
+    });
     let is_quoted = value.starts_with(['"', '\'']);
     let text = if DeTable::parse(&plain).is_ok() && (is_quoted || !takes_a_word) {
         plain
@@ -94,7 +100,14 @@ fn add_table(
             add_table(&path, inner, source, layer)?;
             continue;
         }
-        let Some(key) = keys::find(&path) else {
+        let of_section = if prefix == keys::SUITE_SENSORS {
+            let kind = table.iter().find(|(key, _)| key.get_ref() == "kind");
+            let kind = kind.and_then(|(_, kind)| kind.get_ref().as_str());
+            kind.and_then(|kind| keys::of_section(kind, name.get_ref()))
+        } else {
+            None
+        };
+        let Some(key) = of_section.or_else(|| keys::find(&path)) else {
             let place = SourceSpan {
                 source: source.clone(),
                 span: name.span(),
@@ -124,7 +137,14 @@ fn add_table(
         let (value, entries) = match key.kind {
             ValueKind::Tables(keys) => {
                 let entries = tables(key, keys, value, source)?.ok_or_else(refused)?;
-                (list_of(key, &entries), entries)
+                (list_of(&entries), entries)
+            }
+            ValueKind::Suites(keys) => {
+                let entries = match value.get_ref().as_str() {
+                    Some(name) => vec![suites::named(name, &place)],
+                    None => tables(key, keys, value, source)?.ok_or_else(refused)?,
+                };
+                (list_of(&entries), entries)
             }
             _ => (check(key, value).ok_or_else(refused)?, Vec::new()),
         };
@@ -171,8 +191,9 @@ fn tables(
 }
 
 /// A list of tables as the run file will hold it.
-fn list_of(key: &ConfigKey, entries: &[SettingsLayer]) -> Value {
-    let leaf = |path: &str| path[key.path.len() + 1..].to_owned();
+fn list_of(entries: &[SettingsLayer]) -> Value {
+    // A sensor of a suite has keys of its section.
+    let leaf = |path: &'static str| path.rsplit('.').next().unwrap_or(path).to_owned();
     let table = |layer: &SettingsLayer| {
         let values = layer.iter().map(|(path, setting)| (leaf(path), setting.value.clone()));
         Value::Object(values.collect())
@@ -182,8 +203,10 @@ fn list_of(key: &ConfigKey, entries: &[SettingsLayer]) -> Value {
 
 /// Checks every text of a key whose texts have a form.
 fn check_form(key: &'static ConfigKey, value: &Spanned<DeValue<'_>>, source: &NamedText) -> Result<(), ConfigError> {
-    let (ValueKind::TextOf(form) | ValueKind::TextsOf(form)) = key.kind else {
-        return Ok(());
+    let form = match key.kind {
+        ValueKind::TextOf(form) | ValueKind::TextsOf(form) => form,
+        ValueKind::Suites(_) if value.get_ref().is_str() => TextForm::Suite,
+        _ => return Ok(()),
     };
     let items = match value.get_ref() {
         DeValue::Array(items) => items.iter().collect(),
@@ -234,7 +257,7 @@ fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
             list.filter(|list| !list.is_empty()).map(Value::from)
         }
         // `tables` checks these.
-        ValueKind::Tables(_) => None,
+        ValueKind::Tables(_) | ValueKind::Suites(_) => None,
     }
 }
 

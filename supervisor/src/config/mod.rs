@@ -5,6 +5,7 @@ pub mod keys;
 pub mod layer;
 pub mod rules;
 pub mod span;
+pub mod suites;
 pub mod text_form;
 
 use std::path::Path;
@@ -156,12 +157,15 @@ impl LayeredSettings {
             let value = self
                 .setting(key.path)
                 .map_or(Value::Null, |setting| setting.value.clone());
-            let (table, name) = key.path.split_once('.').unwrap_or(("", key.path));
+            let Some((table, name)) = key.path.split_once('.') else {
+                continue;
+            };
             let table = root.entry(table).or_insert_with(|| Value::Object(Map::new()));
             if let Value::Object(table) = table {
                 table.insert(name.to_owned(), value);
             }
         }
+        suites::complete(self, &mut root)?;
         let config: Config = serde_json::from_value(Value::Object(root)).map_err(|error| ConfigError::File {
             path: "configuration".into(),
             message: error.to_string(),

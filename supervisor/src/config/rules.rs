@@ -7,6 +7,7 @@ use ipc_schema::{
 
 mod curriculum;
 mod sensors;
+mod suites;
 
 use super::{ConfigError, LayeredSettings, layer::LocatedValue};
 
@@ -25,6 +26,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         }
     }
     sensors::check(settings, config)?;
+    suites::check(settings, config)?;
     recorded_channels(settings, config)?;
     let trainer = &config.trainer;
     if trainer.batch_size > trainer.horizon {
@@ -288,7 +290,8 @@ fn conflict_in_entry(
     conflict_at(setting.or(list), message, help)
 }
 
-fn conflict_at(setting: Option<&LocatedValue>, message: String, help: String) -> ConfigError {
+/// A conflict at a setting, if it was set.
+pub(super) fn conflict_at(setting: Option<&LocatedValue>, message: String, help: String) -> ConfigError {
     match setting {
         Some(setting) => ConfigError::Conflict {
             message,

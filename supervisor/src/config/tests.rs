@@ -1,4 +1,5 @@
 use super::*;
+use ipc_schema::sensor::SensorKind;
 
 fn config_of(text: &str) -> Result<Config, ConfigError> {
     layer::parse("my.toml", text).and_then(|layer| {
@@ -298,37 +299,49 @@ mod reference {
         let mut text = String::from(INTRODUCTION);
         let mut table = "";
         for key in keys::KEYS {
-            let (name, _) = key.path.split_once('.').unwrap();
+            let (name, leaf) = key.path.split_once('.').unwrap_or((key.path, ""));
             if name != table {
+                let heading = if leaf.is_empty() {
+                    format!("[[{name}]]")
+                } else {
+                    format!("[{name}]")
+                };
                 text.push_str(&format!(
-                    "\n## `[{name}]`\n\n| key | default | allowed | unit | meaning |\n|---|---|---|---|---|\n"
+                    "\n## `{heading}`\n\n| key | default | allowed | unit | meaning |\n|---|---|---|---|---|\n"
                 ));
                 table = name;
             }
             let default = defaults.setting(key.path).map_or("none".into(), |setting| {
                 setting.place.source.inner()[setting.place.span.clone()].to_owned()
             });
-            let leaf = key.path.split_once('.').unwrap().1;
+            let shown = if leaf.is_empty() { name } else { leaf };
             text.push_str(&format!(
-                "| `{leaf}` | `{default}` | {} | {} | {} |\n",
+                "| `{shown}` | `{default}` | {} | {} | {} |\n",
                 key.range(),
                 key.unit,
                 key.meaning
             ));
-            if let keys::ValueKind::Tables(entries) = key.kind {
-                for entry in entries {
-                    let optional = if entry.optional { "none" } else { "" };
-                    text.push_str(&format!(
-                        "| `{leaf}.{}` | `{optional}` | {} | {} | {} |\n",
-                        entry.leaf(),
-                        entry.range(),
-                        entry.unit,
-                        entry.meaning
-                    ));
-                }
+            if let keys::ValueKind::Tables(entries) | keys::ValueKind::Suites(entries) = key.kind {
+                add_entries(shown, entries, &mut text);
             }
         }
         text
+    }
+
+    fn add_entries(list: &str, entries: &[keys::ConfigKey], text: &mut String) {
+        for entry in entries {
+            let optional = if entry.optional { "none" } else { "" };
+            let name = format!("{list}.{}", entry.leaf());
+            text.push_str(&format!(
+                "| `{name}` | `{optional}` | {} | {} | {} |\n",
+                entry.range(),
+                entry.unit,
+                entry.meaning
+            ));
+            if let keys::ValueKind::Tables(entries) = entry.kind {
+                add_entries(&name, entries, text);
+            }
+        }
     }
 
     const INTRODUCTION: &str = "\
@@ -689,4 +702,129 @@ fn heroes_count_as_road_users() {
     let (message, _) =
         error_of("task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.module = \"mine\"\ntraffic.max_road_users = 52");
     assert!(message.contains("less than the 53 road users"), "{message}");
+}
+
+const TWO_CAMERAS: &str = "[[suite]]\nname = \"pair\"\nclasses = [\"bus\"]\nshare = 0.5\n\
+    [[suite.sensor]]\nkind = \"camera\"\nname = \"left\"\nwidth = 42\nperiod_ticks = 3\n\
+    [[suite.sensor]]\nkind = \"camera\"\nname = \"right\"\nmount = [1, 2, 3, 0, 0, 0.5]\nperiod_s = 0.2\n";
+
+#[test]
+fn a_sensor_of_a_suite_is_its_section_with_exceptions() {
+    let config = config_of(&format!("camera.height = 99\n{TWO_CAMERAS}")).unwrap();
+    let suite = &config.suites[0];
+    assert_eq!(
+        (suite.name.as_str(), suite.share, suite.classes.as_slice()),
+        ("pair", 0.5, ["bus".to_owned()].as_slice())
+    );
+    let periods: Vec<u32> = suite.sensors.iter().map(|sensor| sensor.period_ticks).collect();
+    assert_eq!(periods, [3, 2]);
+    let units = config.sensor_units(SensorKind::Camera);
+    let [left, right] = [0, 1].map(|place: usize| config.with_unit(&units[place]).camera);
+    assert_eq!(
+        (left.width, left.height, left.mount, left.period_s),
+        (42, 99, config.camera.mount, 0.3)
+    );
+    assert_eq!(
+        (right.width, right.height, right.mount),
+        (config.camera.width, 99, [1.0, 2.0, 3.0, 0.0, 0.0, 0.5])
+    );
+    // What a run writes is a configuration.
+    let again = layer::parse("again", &to_toml(&config).unwrap()).unwrap();
+    assert_eq!(LayeredSettings(again).validate().unwrap(), config);
+}
+
+#[test]
+fn ready_made_suites_are_known_by_name() {
+    for (name, _) in suites::READY_MADE_SUITES {
+        let settings = LayeredSettings::defaults().unwrap();
+        let config = settings
+            .with_assignments(&[format!("suite={name}:3")])
+            .unwrap()
+            .validate()
+            .unwrap();
+        assert_eq!(
+            (config.suites[0].name.as_str(), config.suites[0].first),
+            (name, Some(3))
+        );
+        let again = layer::parse("again", &to_toml(&config).unwrap()).unwrap();
+        assert_eq!(LayeredSettings(again).validate().unwrap(), config);
+    }
+    let nuscenes = config_of("suite = \"nuscenes\"\n").unwrap();
+    let of_kind =
+        [SensorKind::Lidar, SensorKind::Camera, SensorKind::Radar].map(|kind| nuscenes.sensor_units(kind).len());
+    assert_eq!(of_kind, [1, 6, 5]);
+    let mine = "[[suite]]\npreset = \"kitti\"\nname = \"mine\"\n[[suite.sensor]]\nkind = \"radar\"\nname = \"front\"\n";
+    let mine = config_of(mine).unwrap();
+    assert_eq!(
+        (mine.suites[0].name.as_str(), mine.suites[0].sensors.len()),
+        ("mine", 8)
+    );
+    let (message, help) = error_of("suite = \"kity\"\n");
+    assert_eq!(message, "my.toml:1: `suite`: \"kity\" is no ready-made suite");
+    assert!(help.contains("kitti, nuscenes, paper"), "{help}");
+    assert!(
+        error_of("suite = \"kitti:few\"\n")
+            .0
+            .contains("\"few\" is no number of slots")
+    );
+}
+
+#[test]
+fn faults_of_suites_are_named_with_their_lines() {
+    let after = |line: &str| error_of(&format!("{TWO_CAMERAS}{line}\n"));
+    for (text, message) in [
+        ("widht = 3", "my.toml:15: unknown key `suite.sensor.widht`"),
+        ("width = 0", "my.toml:15: `camera.width` cannot be 0"),
+        ("vehicles = 3", "my.toml:15: unknown key `suite.sensor.vehicles`"),
+        (
+            "period_ticks = 3",
+            "my.toml:14: `period_s` = 0.2 s and `period_ticks` = 3",
+        ),
+        ("[[suite]]\nname = \"empty\"", "my.toml:"),
+        (
+            "[[suite]]\npreset = \"kitti\"\nname = \"pair\"",
+            "my.toml:17: two suites have the name \"pair\"",
+        ),
+        (
+            "[[suite]]\nname = \"x\"\nclasses = [\"sedan\"]",
+            "my.toml:17: `suite.classes`: \"sedan\" is no vehicle class",
+        ),
+        (
+            "[[suite.sensor]]\nkind = \"camera\"\nname = \"left\"",
+            "has two sensors with the name \"left\"",
+        ),
+        (
+            "[[suite.sensor]]\nkind = \"sonar\"\nname = \"s\"",
+            "my.toml:16: `suite.sensor.kind` cannot be \"sonar\"",
+        ),
+        (
+            "[[suite.sensor]]\nname = \"s\"",
+            "entry 3 of `suite.sensor` has no `kind`",
+        ),
+        (
+            "[[suite.sensor]]\nkind = \"imu\"\nname = \"s\"\nperiod_ticks = 2",
+            "my.toml:18: a sensor of a suite of kind \"imu\" has no `period_ticks`",
+        ),
+        (
+            "[[suite.sensor]]\nkind = \"radar\"\nname = \"s\"\nperiod_s = 0.25",
+            "my.toml:18: `radar.period_s` = 0.25 s of a sensor of a suite is not",
+        ),
+        (
+            "[[suite.sensor]]\nkind = \"lidar\"\nname = \"s\"\nrotation_hz = 7",
+            "suite \"pair\", sensor \"s\": `lidar.rotation_hz` = 7: a rotation must be",
+        ),
+        (
+            "[[roadside]]\nname = \"m\"\nsuite = \"mast\"\nx_m = 1\ny_m = 2",
+            "my.toml:17: \"m\" carries the suite \"mast\", which",
+        ),
+        (
+            "[[roadside]]\nname = \"m\"\nsuite = \"pair\"\nx_m = 1",
+            "my.toml:16: \"m\" beside the road needs exactly one place",
+        ),
+    ] {
+        let (said, help) = after(text);
+        assert!(said.contains(message), "{text}: {said}");
+        assert!(!help.is_empty(), "{said}");
+    }
+    assert!(error_of("[suite]\nname = \"a\"\n").0.contains("`suite` cannot be"));
 }

@@ -8,6 +8,8 @@ use ipc_schema::{
     traffic::VEHICLE_CLASSES,
 };
 
+use super::suites;
+
 /// Form of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextForm {
@@ -27,6 +29,10 @@ pub enum TextForm {
     Obstacle,
     /// A [`PropName`].
     Prop,
+    /// A ready-made suite, and the number of slots whose vehicles carry it.
+    Suite,
+    /// One of [`VEHICLE_CLASSES`].
+    VehicleClass,
 }
 
 impl TextForm {
@@ -44,6 +50,9 @@ impl TextForm {
             Self::Network => read::<Network>(text),
             Self::Obstacle => read::<Obstacle>(text),
             Self::Prop => read::<PropName>(text),
+            Self::Suite => suites::ready_made(text).map(drop),
+            Self::VehicleClass if VEHICLE_CLASSES.contains(&text) => Ok(()),
+            Self::VehicleClass => Err(format!("\"{text}\" is no vehicle class of SUMO")),
         }
     }
 
@@ -65,6 +74,8 @@ impl TextForm {
                 prop_names()
             ),
             Self::Prop => format!("props: {}", prop_names()),
+            Self::Suite => format!("\"NAME\", \"NAME:SLOTS\" with a name of {}", suites::names()),
+            Self::VehicleClass => VEHICLE_CLASSES.join(", "),
         }
     }
 }

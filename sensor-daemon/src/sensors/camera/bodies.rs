@@ -70,7 +70,8 @@ impl CameraTargets {
     /// Replaces the road users by those at the end of the tick of `targets`.
     pub fn update(&mut self, targets: &Targets) {
         self.users.clear();
-        self.users.extend(targets.movers.iter().map(RoadUserBody::new));
+        let road_users = &targets.movers[..targets.road_users];
+        self.users.extend(road_users.iter().map(RoadUserBody::new));
     }
 
     /// Number of road users.

@@ -3,6 +3,8 @@
 //! The result depends on the configuration and the world of the tick alone, not on threads, the order of objects or the processor. How it
 //! works and what it costs: docs/camera.md.
 
+use std::sync::Arc;
+
 use ipc_schema::config::Config;
 use sim_core::scene::Scene;
 
@@ -34,6 +36,13 @@ use crate::sensors::lidar::{
 #[derive(Debug)]
 pub struct CameraModel {
     optics: optics::CameraOptics,
+    sight: Arc<SightScene>,
+    path: ScanPath,
+}
+
+/// What stands still around cameras, and its light: one serves all cameras of a map.
+#[derive(Debug)]
+pub struct SightScene {
     bodies: bodies::StillBodies,
     ground: ground::GroundMap,
     light: light::Daylight,
@@ -42,7 +51,26 @@ pub struct CameraModel {
     /// Height of flat ground; `None` if it is not flat.
     ground_m: Option<f64>,
     relief: Option<relief::Relief>,
-    path: ScanPath,
+}
+
+impl SightScene {
+    /// A scene. Props of interest and the weather are those of the configuration.
+    #[must_use]
+    pub fn new(config: &Config, scene: &Scene) -> Self {
+        let light = light::Daylight::new(&config.weather);
+        let mut ground_colours = Box::new([[0.0; 3]; 256]);
+        for label in SemanticLabel::ALL {
+            ground_colours[label as usize] = light.on_ground(label);
+        }
+        Self {
+            bodies: bodies::StillBodies::new(&config.lidar, scene),
+            ground: ground::GroundMap::new(scene),
+            light,
+            ground_colours,
+            ground_m: flat_ground_m(scene),
+            relief: relief::Relief::new(scene),
+        }
+    }
 }
 
 /// Working memory of one thread: empty at first, then kept.
@@ -82,19 +110,15 @@ impl CameraModel {
     /// A camera in a scene. Props of interest and the weather are those of the configuration.
     #[must_use]
     pub fn new(params: &CameraParams, config: &Config, scene: &Scene) -> Self {
-        let light = light::Daylight::new(&config.weather);
-        let mut ground_colours = Box::new([[0.0; 3]; 256]);
-        for label in SemanticLabel::ALL {
-            ground_colours[label as usize] = light.on_ground(label);
-        }
+        Self::in_sight(params, Arc::new(SightScene::new(config, scene)))
+    }
+
+    /// A camera in a scene that it shares with others.
+    #[must_use]
+    pub fn in_sight(params: &CameraParams, sight: Arc<SightScene>) -> Self {
         Self {
             optics: optics::CameraOptics::new(params),
-            bodies: bodies::StillBodies::new(&config.lidar, scene),
-            ground: ground::GroundMap::new(scene),
-            light,
-            ground_colours,
-            ground_m: flat_ground_m(scene),
-            relief: relief::Relief::new(scene),
+            sight,
             path: ScanPath::best(),
         }
     }
@@ -197,6 +221,7 @@ impl CameraModel {
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
     ) {
+        let sight = &*self.sight;
         let view = view::CameraView {
             optics: &self.optics,
             pose: pose.0,
@@ -209,17 +234,17 @@ impl CameraModel {
         } = scratch;
         // Gather what may be in the image, and sort it.
         list.clear();
-        surfaces.begin((!planes.rgb.is_empty()).then_some(self.light));
-        self.bodies.gather(&view, list, surfaces);
+        surfaces.begin((!planes.rgb.is_empty()).then_some(sight.light));
+        sight.bodies.gather(&view, list, surfaces);
         targets.gather(&view, carrier, list, surfaces);
-        if let Some(relief) = &self.relief {
+        if let Some(relief) = &sight.relief {
             relief.gather(&view, list);
         }
         list.sort();
         // Find the first surface of each pixel.
         canvas.room_for(&self.optics);
         canvas.fill::<S>(
-            self.ground_m.and_then(|ground_m| view.ground(ground_m)),
+            sight.ground_m.and_then(|ground_m| view.ground(ground_m)),
             (1.0 / self.optics.range_m) as f32,
         );
         canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
@@ -230,9 +255,9 @@ impl CameraModel {
             canvas,
             view,
             surfaces,
-            ground: &self.ground,
-            light: &self.light,
-            ground_colours: &self.ground_colours,
+            ground: &sight.ground,
+            light: &sight.light,
+            ground_colours: &sight.ground_colours,
         };
         resolver.write::<S>(planes, counts);
         objects.clear();

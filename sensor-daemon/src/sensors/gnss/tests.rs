@@ -41,6 +41,7 @@ fn open_sky(receiver: &GnssReceiver, place_m: [f64; 3], white: &NormalBlock) -> 
         place_m,
         &GnssErrors {
             white,
+            unit_bias_m: &[0.0; 3],
             correlated: &[0.0; 3],
             view: &SkyView::default(),
             factor: 1.0,
@@ -186,6 +187,7 @@ fn the_receivers_estimate_is_the_root_mean_square_of_its_errors() {
             [100.0, 50.0, 0.0],
             &GnssErrors {
                 white: &stream(NoiseStream::Gnss).normals(index),
+                unit_bias_m: &[0.0; 3],
                 correlated: &[e, n, u],
                 view: &view,
                 factor: 1.5,
@@ -265,6 +267,7 @@ fn reflections_move_a_fix_and_a_smartphone_errs_more() {
         [129.0, 126.0, 0.0],
         &GnssErrors {
             white: &[0.0; 4],
+            unit_bias_m: &[0.0; 3],
             correlated: &[0.0; 3],
             view: &view,
             factor: 2.0,

@@ -1,6 +1,9 @@
 //! One scan: splits the tick into spans, gathers candidates, draws surfaces and writes returns.
 
-use ipc_schema::pointcloud::{LidarPoint, Scan};
+use ipc_schema::{
+    config::OWN_SENSOR,
+    pointcloud::{LidarPoint, Scan},
+};
 
 use super::{
     LidarModel, Targets,
@@ -136,7 +139,8 @@ impl ScanOrder<'_> {
             axes: u32::from(lidar.is_paper),
             vehicle: mover.object,
             azimuths: lidar.columns() as u32,
-            reserved: [0; 2],
+            sensor: OWN_SENSOR,
+            reserved: 0,
         }
     }
 

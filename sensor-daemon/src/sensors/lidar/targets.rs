@@ -49,6 +49,8 @@ pub(in crate::sensors) struct MovingTarget {
 #[derive(Debug, Clone, Default)]
 pub struct Targets {
     pub(in crate::sensors) movers: Vec<MovingTarget>,
+    /// How many of `movers` are road users; those behind them are carriers beside the road, which nothing sees.
+    pub(in crate::sensors) road_users: usize,
     /// Poses at the ends of sub-steps, road user by road user.
     knots: Vec<Knot>,
     pub(in crate::sensors) sub_steps: usize,
@@ -81,6 +83,13 @@ impl Targets {
             self.near.push([x, y, mover.radius_m + mover.travel_m]);
             self.movers.push(mover);
         }
+        self.road_users = states.len();
+    }
+
+    /// Adds carriers of sensors that stand still and that nothing sees, behind the road users of the last [`Targets::update`].
+    pub fn add_fixed(&mut self, states: &[VehicleState]) {
+        self.movers
+            .extend(states.iter().map(|state| MovingTarget::new(state, &[])));
     }
 
     /// Pose of a road user at share `at` (0 … 1) of a sub-step that takes `dt_s`.
@@ -119,11 +128,12 @@ impl Targets {
     pub(in crate::sensors) fn is_upright(&self, row: usize) -> bool {
         let mover = &self.movers[row];
         let [roll, pitch, _] = mover.end.attitude_rad;
+        if roll != 0.0 || pitch != 0.0 || mover.is_still {
+            return roll == 0.0 && pitch == 0.0;
+        }
         let knots = &self.knots[row * self.sub_steps..(row + 1) * self.sub_steps];
         let level = |knot: &Knot| knot[4] == 0.0 && knot[5] == 0.0;
-        roll == 0.0
-            && pitch == 0.0
-            && (mover.is_still || (knots.iter().all(level) && mover.rates[4] == 0.0 && mover.rates[5] == 0.0))
+        knots.iter().all(level) && mover.rates[4] == 0.0 && mover.rates[5] == 0.0
     }
 }
 

@@ -4,10 +4,10 @@
 //! detected with the probability that Swerling's case 1 gives. Random numbers are keyed by episode, vehicle, tick and cell. Equations and
 //! sources: docs/sensor-models.md.
 
-use std::{collections::BTreeMap, f64::consts::TAU};
+use std::{collections::BTreeMap, f64::consts::TAU, sync::Arc};
 
 use ipc_schema::{
-    config::{Config, RadarConfig},
+    config::{Config, OWN_SENSOR, RadarConfig},
     pointcloud::{GROUND, STATIC_OBJECT},
     radar::{NO_OBJECT, RadarDetection, RadarScan},
     sensor::NoiseStream,
@@ -21,6 +21,7 @@ pub use equation::{RadarEquation, from_db, rain_db_per_km, to_db};
 
 use super::camera::{
     CameraModel, CameraParams, CameraPose, CameraScratch, CameraTargets, ImagePlanes, SKY_INSTANCE, SemanticLabel,
+    SightScene,
 };
 use crate::{noise::normals::philox4x32, sensors::lidar::Targets};
 
@@ -131,10 +132,16 @@ impl RadarModel {
     /// The radar of a configuration in a scene.
     #[must_use]
     pub fn new(config: &Config, scene: &Scene) -> Self {
+        Self::in_sight(config, Arc::new(SightScene::new(config, scene)))
+    }
+
+    /// The radar of a configuration in a scene that it shares with others.
+    #[must_use]
+    pub fn in_sight(config: &Config, sight: Arc<SightScene>) -> Self {
         let radar = &config.radar;
         let equation = RadarEquation::new(radar, config.weather.rain_mmph);
         let params = rays(radar);
-        let eyes = CameraModel::new(&params, config, scene);
+        let eyes = CameraModel::in_sight(&params, sight);
         let focal = eyes.focal_px();
         let [width, height] = eyes.size();
         let directions = (0..width * height).map(|pixel| {
@@ -203,6 +210,8 @@ impl RadarModel {
             velocity_resolution_mps: equation.velocity_resolution_mps as f32,
             velocity_ambiguity_mps: equation.velocity_ambiguity_mps as f32,
             azimuth_resolution_rad: equation.azimuth_resolution_rad as f32,
+            sensor: OWN_SENSOR,
+            reserved: 0,
         })
     }
 

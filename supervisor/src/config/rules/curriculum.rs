@@ -163,6 +163,7 @@ fn positioned_key(config: &Config) -> Option<&'static str> {
         ("scene.meshes", !scene.meshes.is_empty()),
         ("region.polygon_m", !region.polygon_m.is_empty()),
         ("region.radius_m", region.radius_m > 0.0),
+        ("roadside", !config.roadsides.is_empty()),
     ];
     keys.into_iter().find_map(|(key, is_used)| is_used.then_some(key))
 }

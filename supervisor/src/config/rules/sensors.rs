@@ -26,7 +26,7 @@ pub(super) fn tick_periods(config: &Config) -> impl Iterator<Item = (String, f64
 }
 
 /// Key, message and help of a broken rule.
-type BrokenSensorRule = (&'static str, String, String);
+pub(super) type BrokenSensorRule = (&'static str, String, String);
 
 /// A fast IMU divides the tick and is divided by the sub-step; a slow one is a whole number of ticks.
 fn imu(config: &Config) -> Option<BrokenSensorRule> {
@@ -49,7 +49,7 @@ fn imu(config: &Config) -> Option<BrokenSensorRule> {
     })
 }
 
-fn lidar(config: &Config) -> Option<BrokenSensorRule> {
+pub(super) fn lidar(config: &Config) -> Option<BrokenSensorRule> {
     let lidar = &config.lidar;
     if lidar.vehicles == 0 {
         return None;
@@ -140,7 +140,9 @@ fn observation(config: &Config) -> Option<BrokenSensorRule> {
             return Some((
                 "observation.fields",
                 format!("`observation.fields` has \"{field}\", which the sensor `{name}` measures"),
-                format!("set {name}.vehicles to the number of vehicles that carry one, or leave the field out"),
+                format!(
+                    "set {name}.vehicles to the number of vehicles that carry one, give them a suite with one, or leave the field out"
+                ),
             ));
         }
     }
