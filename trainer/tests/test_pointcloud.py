@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from caraware.ipc.mounts import MountedSensor
 from caraware.ipc.pointcloud import POINT, SCAN, PointCloud, rotation
 
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
@@ -24,7 +25,7 @@ def cloud(points_m: list[list[float]], attitude: list[float], axes: int = 0) -> 
     points["position_m"] = points_m
     scan = np.zeros(1, SCAN)
     scan["position_m"], scan["attitude_rad"], scan["axes"] = [100.0, 50.0, 2.0], attitude, axes
-    return PointCloud(0, 0, 0, scan[0], points)
+    return PointCloud(0, 0, 0, MountedSensor("cav.0", "", "lidar", (), is_roadside=False), scan[0], points)
 
 
 def test_a_point_ahead_of_a_car_that_heads_north_lies_north() -> None:

@@ -20,6 +20,7 @@ from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArra
 from caraware.ipc.commits import CommitLog, CommittedPosition, EpisodeStarts
 from caraware.ipc.image import Image
 from caraware.ipc.lane_positions import LanePositions
+from caraware.ipc.mounts import SensorNames
 from caraware.ipc.pointcloud import PointCloud
 from caraware.ipc.radar import RadarDetections
 from caraware.ipc.road_users import RoadUserStates
@@ -390,29 +391,33 @@ class Channel:
         """
         return _native.Lease(self._attachment, _lent_tensor)
 
+    @cached_property
+    def _sensors(self) -> SensorNames:
+        return SensorNames(self.run)
+
     def scans(self) -> list[PointCloud]:
         """LIDAR scans since the last call, oldest first; the newest of them if more came than shared memory holds.
 
-        One for each vehicle that carries a LIDAR (`lidar.vehicles`) and each tick. The first call subscribes and
-        gives none.
+        One for each LIDAR (`lidar.vehicles`, `[[suite]]`) and each tick in which it samples; `mounted` names it and its
+        carrier. The first call subscribes and gives none.
         """
-        return [PointCloud.of(scan) for scan in self._attachment.scans()]
+        return [PointCloud.of(scan, self._sensors) for scan in self._attachment.scans()]
 
     def images(self) -> list[Image]:
         """Images since the last call, oldest first; the newest of them if more came than shared memory holds.
 
-        One for each vehicle that carries a camera (`camera.vehicles`) and each sample. The first call subscribes and
-        gives none.
+        One for each camera (`camera.vehicles`, `[[suite]]`) and each sample; `mounted` names it and its carrier. The
+        first call subscribes and gives none.
         """
-        return [Image.of(image) for image in self._attachment.images()]
+        return [Image.of(image, self._sensors) for image in self._attachment.images()]
 
     def detections(self) -> list[RadarDetections]:
         """Radar scans since the last call, oldest first; the newest of them if more came than shared memory holds.
 
-        One for each vehicle that carries a radar (`radar.vehicles`) and each sample. The first call subscribes and
-        gives none.
+        One for each radar (`radar.vehicles`, `[[suite]]`) and each sample; `mounted` names it and its carrier. The
+        first call subscribes and gives none.
         """
-        return [RadarDetections.of(scan) for scan in self._attachment.detections()]
+        return [RadarDetections.of(scan, self._sensors) for scan in self._attachment.detections()]
 
     def lane_positions(self) -> list[LanePositions]:
         """SUMO's lanes, edges and route positions since the last call, oldest first (`traffic.lane_positions`).

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from caraware import _native
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.layout import record
+from caraware.ipc.mounts import MountedSensor, SensorNames
 
 IMAGE = record("ImageHead")
 """`ImageHead`: the camera in the world at the end of the tick (m; roll, pitch, heading in rad), and its setup."""
@@ -64,7 +65,10 @@ class Image:
     tick: int
     sim_time_ns: int
     vehicle: int
-    """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
+    """Dense index of the vehicle within its episode, as in `Observation.vehicle`; beside the road `mounts.ROADSIDE` and
+    a number."""
+    mounted: MountedSensor
+    """The carrier and the sensor, by name."""
     head: np.void
     """`IMAGE`."""
     objects: NDArray[np.void]
@@ -81,7 +85,7 @@ class Image:
     """u8 [height, width]: 255 on road users and props of interest, else 0."""
 
     @classmethod
-    def of(cls, native: _native.SightMessage) -> "Image":
+    def of(cls, native: _native.SightMessage, names: SensorNames) -> "Image":
         """From a message. Raises ValueError for planes that do not fit the image's size."""
         head_bytes, plane_bytes, object_bytes = native.sections
         head = np.frombuffer(head_bytes, IMAGE)[0]
@@ -90,6 +94,7 @@ class Image:
             tick=native.tick,
             sim_time_ns=native.sim_time_ns,
             vehicle=int(head["vehicle"]),
+            mounted=names.of("camera", head),
             head=head,
             objects=np.frombuffer(object_bytes, SEEN),
             depth_m=planes["depth_m"],

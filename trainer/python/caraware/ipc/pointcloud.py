@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from caraware import _native
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.layout import record
+from caraware.ipc.mounts import MountedSensor, SensorNames
 
 POINT = record("LidarPoint")
 """`LidarPoint`: position in the sensor's axes at the time the point was fired (m), intensity 0 ... 1, object, cosine of
@@ -50,20 +51,25 @@ class PointCloud:
     tick: int
     sim_time_ns: int
     vehicle: int
-    """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
+    """Dense index of the vehicle within its episode, as in `Observation.vehicle`; beside the road `mounts.ROADSIDE` and
+    a number."""
+    mounted: MountedSensor
+    """The carrier and the sensor, by name."""
     scan: np.void
     """`SCAN`."""
     points: NDArray[np.void]
     """`POINT [count]`, read-only."""
 
     @classmethod
-    def of(cls, native: _native.PointCloud) -> "PointCloud":
+    def of(cls, native: _native.PointCloud, names: SensorNames) -> "PointCloud":
         """From a message."""
+        scan = np.frombuffer(native.scan, SCAN)[0]
         return cls(
             tick=native.tick,
             sim_time_ns=native.sim_time_ns,
             vehicle=native.vehicle,
-            scan=np.frombuffer(native.scan, SCAN)[0],
+            mounted=names.of("lidar", scan),
+            scan=scan,
             points=np.frombuffer(native.points, POINT),
         )
 

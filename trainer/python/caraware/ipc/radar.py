@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from caraware import _native
 from caraware.ipc.layout import record
+from caraware.ipc.mounts import MountedSensor, SensorNames
 
 DETECTION = record("RadarDetection")
 """`RadarDetection`: range (m), azimuth and elevation (rad, sensor's frame), radial velocity (m/s, positive towards the
@@ -26,14 +27,17 @@ class RadarDetections:
     tick: int
     sim_time_ns: int
     vehicle: int
-    """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
+    """Dense index of the vehicle within its episode, as in `Observation.vehicle`; beside the road `mounts.ROADSIDE` and
+    a number."""
+    mounted: MountedSensor
+    """The carrier and the sensor, by name."""
     scan: np.void
     """`RADAR_SCAN`."""
     detections: NDArray[np.void]
     """`DETECTION [count]`, read-only, nearest first."""
 
     @classmethod
-    def of(cls, native: _native.SightMessage) -> "RadarDetections":
+    def of(cls, native: _native.SightMessage, names: SensorNames) -> "RadarDetections":
         """From a message."""
         scan_bytes, detection_bytes = native.sections
         scan = np.frombuffer(scan_bytes, RADAR_SCAN)[0]
@@ -41,6 +45,7 @@ class RadarDetections:
             tick=native.tick,
             sim_time_ns=native.sim_time_ns,
             vehicle=int(scan["vehicle"]),
+            mounted=names.of("radar", scan),
             scan=scan,
             detections=np.frombuffer(detection_bytes, DETECTION),
         )

@@ -2,10 +2,13 @@
 
 A part is a directory of one episode with a directory for each carrier, in which `training/` is as KITTI's. Frames are
 numbered by ticks. The camera's frame is KITTI's: x right, y down, z forward; without a camera it is at the LIDAR.
+Places of sensors are those of their mounts.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +18,13 @@ from PIL import Image
 from caraware.data.export.oxts import Geodesy, packet
 from caraware.data.export.scans import (
     OPTICAL,
+    CameraImage,
     Frame,
     box_middle,
     class_by_size,
     forward_m,
     frames,
     inverse,
-    pose,
     projection,
     rotated,
     upright_pose,
@@ -45,12 +48,22 @@ LARGELY_HIDDEN, PARTLY_HIDDEN = 0.25, 0.6
 """Share of the pixels of a road user's box that show it, below which KITTI's `occluded` is 2 and 1."""
 
 
+CAMERA_NUMBERS = (2, 3, 0, 1)
+"""Numbers of a carrier's cameras, the main one first, unless they are named `image_0` to `image_3` as KITTI's are."""
+
+
+def numbered(images: Sequence[CameraImage]) -> dict[int, CameraImage]:
+    """The images of a frame by KITTI's numbers of cameras: at most four."""
+    named = {int(image.camera[-1]): image for image in images if re.fullmatch("image_[0-3]", image.camera)}
+    return named if len(named) == len(images) else dict(zip(CAMERA_NUMBERS, images, strict=False))
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """The sensors of one frame."""
+    """The sensors of one frame. The camera's frame is that of camera 0, or of the main one without a camera 0."""
 
-    projection: Float64Array
-    """f64 [3, 4]: pixels of homogeneous points in the camera's frame; pixel centres have whole numbers."""
+    projections: tuple[Float64Array, ...]
+    """Four of f64 [3, 4]: pixels of homogeneous points in the camera's frame; pixel centres have whole numbers."""
     camera_from_world: Float64Array
     """f64 [3, 4]."""
     camera_from_lidar: Float64Array
@@ -60,20 +73,33 @@ class Calibration:
 
     @classmethod
     def of(cls, frame: Frame) -> Calibration:
-        """From the poses that the messages hold."""
-        lidar, head = frame.world_from_lidar, frame.camera
-        camera = lidar if head is None else pose(head["position_m"], head["attitude_rad"])
-        camera_from_world = rotated(OPTICAL) @ inverse(camera)
+        """From the poses that the messages hold: those of the mounted sensors at the tick."""
+        lidar, cameras = frame.world_from_lidar, numbered(frame.images)
+        reference = cameras.get(0, frame.images[0] if frame.images else None)
+        world_from_camera = lidar if reference is None else reference.world_from_camera
+        camera_from_world = rotated(OPTICAL) @ inverse(world_from_camera)
+        world_from_reference = inverse(camera_from_world)
+
+        def projected(image: CameraImage | None) -> Float64Array:
+            if image is None:
+                return np.eye(3, 4)
+            if image is reference:
+                return projection(image.head)
+            own_from_reference = rotated(OPTICAL) @ inverse(image.world_from_camera) @ world_from_reference
+            matrix: Float64Array = projection(image.head) @ own_from_reference
+            return matrix
+
+        main = frame.images[0] if frame.images else None
         return cls(
-            np.eye(3, 4) if head is None else projection(head),
+            tuple(projected(cameras.get(number, main)) for number in range(4)),
             camera_from_world[:3],
             (camera_from_world @ lidar)[:3],
             (inverse(lidar) @ vehicle_pose(frame.own))[:3],
         )
 
     def text(self) -> str:
-        """The file of `calib/`: there is one camera, so its projection stands for all four."""
-        matrices = [(f"P{number}", self.projection) for number in range(4)]
+        """The file of `calib/`: a camera that the carrier lacks has the projection of the main one."""
+        matrices = [(f"P{number}", matrix) for number, matrix in enumerate(self.projections)]
         matrices += [
             ("R0_rect", np.eye(3)),
             ("Tr_velo_to_cam", self.camera_from_lidar),
@@ -109,8 +135,9 @@ def _image_part(seen: np.void, head: np.void) -> tuple[str, str]:
 
 
 def _labels(frame: Frame, calibration: Calibration, users: RoadUsers) -> str:
-    """The file of `label_2/`: every road user with a point of the LIDAR, or with a pixel of the image."""
-    seen, head = frame.seen, frame.camera
+    """The file of `label_2/`: each road user with a point of the LIDAR or a pixel of an image; boxes of `image_2`."""
+    boxes = numbered(frame.images).get(2)
+    seen, head = ({}, None) if boxes is None else (boxes.seen, boxes.head)
     lines = []
     for state in frame.labelled():
         vehicle = int(state["vehicle"])
@@ -134,7 +161,7 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
         _write_frame(carrier, frame, users)
         (carrier / "training" / "oxts" / f"{frame.scan.tick:06}.txt").write_text(packet(frame.own, geodesy))
     if not any(path.iterdir()):
-        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
+        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")
     for carrier in path.iterdir():
         names = sorted(file.stem for file in (carrier / "training" / "velodyne").iterdir())
         sets = carrier / "ImageSets"
@@ -147,12 +174,14 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
 
 def _write_frame(carrier: Path, frame: Frame, users: RoadUsers) -> None:
     training, name = carrier / "training", f"{frame.scan.tick:06}"
-    for folder in ("velodyne", "calib", "label_2", "oxts", *(["image_2"] if frame.image is not None else [])):
+    images = numbered(frame.images)
+    for folder in ("velodyne", "calib", "label_2", "oxts", *(f"image_{number}" for number in images)):
         (training / folder).mkdir(parents=True, exist_ok=True)
     rows = np.concatenate((forward_m(frame.head, frame.points), frame.points["intensity"][:, None]), 1).astype("<f4")
     (training / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
     calibration = Calibration.of(frame)
     (training / "calib" / f"{name}.txt").write_text(calibration.text(), encoding="utf-8")
     (training / "label_2" / f"{name}.txt").write_text(_labels(frame, calibration, users), encoding="utf-8")
-    if (rgb := frame.rgb) is not None:
-        Image.fromarray(rgb).save(training / "image_2" / f"{name}.png")
+    for number, image in images.items():
+        if (rgb := image.rgb) is not None:
+            Image.fromarray(rgb).save(training / f"image_{number}" / f"{name}.png")

@@ -28,7 +28,6 @@ from caraware.data.export.scans import (
     forward_m,
     frames,
     inverse,
-    pose,
     projection,
     quaternion,
     rotated,
@@ -75,8 +74,17 @@ ATTRIBUTES = {
 VISIBILITIES = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 """Levels of visibility by their tokens."""
 
-SENSORS = {"LIDAR_TOP": "lidar", "CAM_FRONT": "camera"}
-"""Modalities by channel."""
+LIDAR_CHANNEL, CAMERA_CHANNEL = "LIDAR_TOP", "CAM_FRONT"
+"""Channels of the LIDAR and of the camera of a section; cameras of suites have their names for a channel."""
+
+
+def camera_channel(camera: str) -> str:
+    """The channel of a camera with this name; nuScenes' begin with `CAM_`, and so do ours."""
+    if camera == "camera":
+        return CAMERA_CHANNEL
+    name = camera.upper().replace(" ", "_")
+    return name if name.startswith("CAM_") else f"CAM_{name}"
+
 
 TABLES = (
     *("category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor", "ego_pose"),
@@ -108,16 +116,16 @@ def attribute(state: np.void, category_name: str) -> str:
 
 
 def _visibility(frame: Frame, vehicle: int) -> str:
-    """The token of the share of a road user's box that the image shows; empty for a carrier without a camera."""
-    camera = frame.camera
-    if camera is None:
+    """The token of the largest share of a road user's box that an image shows; empty for a carrier without a camera."""
+    if not frame.images:
         return ""
-    if vehicle not in frame.seen:
-        return "1"
-    seen = frame.seen[vehicle]
-    left, top, right, bottom = np.clip(seen["full_box_px"], 0, [camera["width"], camera["height"]] * 2)
-    share = float(seen["visible_px"]) / max(float((right - left) * (bottom - top)), 1.0)
-    return str(1 + sum(share >= least for least in (0.4, 0.6, 0.8)))
+    shares = [0.0]
+    for image in frame.images:
+        if (seen := image.seen.get(vehicle)) is not None:
+            edges = [image.head["width"], image.head["height"]] * 2
+            left, top, right, bottom = np.clip(seen["full_box_px"], 0, edges)
+            shares.append(float(seen["visible_px"]) / max(float((right - left) * (bottom - top)), 1.0))
+    return str(1 + sum(max(shares) >= least for least in (0.4, 0.6, 0.8)))
 
 
 @dataclass
@@ -131,8 +139,8 @@ class _Scene:
     log_token: str
     """Of the episode."""
     tick_s: float
-    with_camera: bool
-    """Its key frames have an image."""
+    cameras: int
+    """Cameras whose images its key frames have."""
     users: RoadUsers
     rows: dict[str, list[Row]] = field(default_factory=lambda: {table: [] for table in TABLES})
     key_tick: int | None = None
@@ -150,17 +158,18 @@ class _Scene:
 
     def add(self, frame: Frame) -> None:
         """Add a frame: a key frame if it is time for one and every sensor of the carrier has delivered."""
-        tick, rgb = frame.scan.tick, frame.rgb
+        tick = frame.scan.tick
+        images = [(image, rgb) for image in frame.images if (rgb := image.rgb) is not None]
         is_due = self.key_tick is None or (tick - self.key_tick) * self.tick_s >= KEY_FRAME_S - 1e-9
-        is_key = is_due and (rgb is not None or not self.with_camera)
+        is_key = is_due and len(images) == self.cameras
         points = np.zeros((len(frame.points), 5), "<f4")
         points[:, :3] = forward_m(frame.head, frame.points) @ LIDAR_AXES
         points[:, 3], points[:, 4] = frame.points["intensity"] * 255, frame.points["channel"]
         lidar = frame.world_from_lidar @ rotated(LIDAR_AXES)
-        self._file(frame, "LIDAR_TOP", is_key, lidar, "pcd.bin").write_bytes(points.tobytes())
-        if rgb is not None and frame.camera is not None:
-            camera = pose(frame.camera["position_m"], frame.camera["attitude_rad"]) @ rotated(OPTICAL.T)
-            Image.fromarray(rgb).save(self._file(frame, "CAM_FRONT", is_key, camera, "png"))
+        self._file(frame, LIDAR_CHANNEL, is_key, lidar, "pcd.bin").write_bytes(points.tobytes())
+        for image, rgb in images:
+            camera, channel = image.world_from_camera @ rotated(OPTICAL.T), camera_channel(image.camera)
+            Image.fromarray(rgb).save(self._file(frame, channel, is_key, camera, "png", image.head))
         if is_key:
             self.key_tick = tick
             self._sample(frame)
@@ -197,7 +206,15 @@ class _Scene:
         self.newest[chain] = row
         self.rows[table].append(row)
 
-    def _file(self, frame: Frame, channel: str, is_key: bool, world_from_sensor: Float64Array, ending: str) -> Path:
+    def _file(
+        self,
+        frame: Frame,
+        channel: str,
+        is_key: bool,
+        world_from_sensor: Float64Array,
+        ending: str,
+        camera: np.void | None = None,
+    ) -> Path:
         """Add the row of a file of a sensor, with the pose of the carrier and of the sensor on it; return its path."""
         tick = frame.scan.tick
         name = Path("samples" if is_key else "sweeps") / channel / f"{self.name}__{channel}__{tick:06}.{ending}"
@@ -207,7 +224,6 @@ class _Scene:
         ego = self.token("ego_pose", channel, tick)
         world_from_ego = vehicle_pose(frame.own)
         self.rows["ego_pose"].append({"token": ego, "timestamp": timestamp, **_placed(world_from_ego)})
-        camera = frame.camera if channel == "CAM_FRONT" else None
         row = {
             "token": self.token(channel, tick),
             "sample_token": "",
@@ -282,22 +298,31 @@ def _placed(transform: Float64Array) -> Row:
     return {"translation": [float(value) for value in transform[:3, 3]], "rotation": quaternion(transform[:3, :3])}
 
 
+def _coloured(recording: Recording) -> set[int]:
+    """Numbers of the cameras that deliver colours."""
+    config = recording.run["config"]
+    suites = [sensor for suite in config.get("suite", []) for sensor in suite["sensor"]]
+    settings = [config["camera"], *(sensor for sensor in suites if sensor["kind"] == "camera")]
+    return {number for number, camera in enumerate(settings) if camera["rgb"]}
+
+
 def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
     path.mkdir(parents=True)
     users, run = RoadUsers(recording), str(recording.start["run"])
     log = token(run, "log", episode.number)
-    has_colours = bool(recording.run["config"]["camera"]["rgb"])
-    cameras = {vehicle for vehicle, _ in filmed(recording, episode)} if has_colours else set()
+    cameras: dict[int, set[int]] = {}
+    for (vehicle, _), numbers in filmed(recording, episode).items():
+        cameras.setdefault(vehicle, set()).update(numbers & _coloured(recording))
     scenes: dict[int, _Scene] = {}
     for frame in frames(recording, episode, every_scan=True):
         vehicle = frame.carrier
         if vehicle not in scenes:
             name = f"scene-{episode.number:05}-{vehicle}"
-            scenes[vehicle] = _Scene(name, run, path, log, recording.tick_s, vehicle in cameras, users)
+            scenes[vehicle] = _Scene(name, run, path, log, recording.tick_s, len(cameras.get(vehicle, ())), users)
         scenes[vehicle].add(frame)
     if not scenes:
-        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
+        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")
     rows: dict[str, list[Row]] = {table: [] for table in TABLES}
     for scene in scenes.values():
         scene.finish()
@@ -329,8 +354,10 @@ def join_parts(recording: Recording, directory: Path, parts: Sequence[str]) -> N
         {"token": level, "level": name, "description": f"visibility {name[1:]} %"}
         for level, name in VISIBILITIES.items()
     ]
+    channels = {LIDAR_CHANNEL, CAMERA_CHANNEL} | {Path(row["filename"]).parent.name for row in tables["sample_data"]}
     tables["sensor"] = [
-        {"token": token(channel), "channel": channel, "modality": modality} for channel, modality in SENSORS.items()
+        {"token": token(name), "channel": name, "modality": "lidar" if name == LIDAR_CHANNEL else "camera"}
+        for name in sorted(channels, reverse=True)
     ]
     # The devkit wants a raster map; a recording has none, so it is one pixel of background.
     mask = f"{VERSION}/map.png"

@@ -24,7 +24,6 @@ from caraware.data.export.scans import (
     forward_m,
     frames,
     inverse,
-    pose,
     require_channels,
     rotated,
     upright_pose,
@@ -205,20 +204,20 @@ def _box(state: np.void, users: RoadUsers) -> Box:
 
 
 def _sensed(frame: Frame, time_ns: int, sink: Sink) -> None:
-    """A scan, the image of its tick, and where both sensors are on their carrier."""
+    """The scan of the first LIDAR, the image of the main camera, and where both are on their carrier."""
     vehicle = name_of(frame.carrier)
     base, vehicle_from_world = f"{vehicle}/base_link", inverse(vehicle_pose(frame.own))
     placed = [Placed(base, f"{vehicle}/lidar", vehicle_from_world @ frame.world_from_lidar)]
-    rgb, camera = frame.rgb, frame.camera
-    if camera is not None:
-        optical = pose(camera["position_m"], camera["attitude_rad"]) @ rotated(OPTICAL.T)
+    image = frame.images[0] if frame.images else None
+    if image is not None:
+        optical = image.world_from_camera @ rotated(OPTICAL.T)
         placed.append(Placed(base, f"{vehicle}/camera_optical", vehicle_from_world @ optical))
     sink.transforms(time_ns, placed)
     sink.points(time_ns, vehicle, forward_m(frame.head, frame.points).astype(np.float32), frame.points)
-    if rgb is not None and camera is not None:
+    if image is not None and (rgb := image.rgb) is not None:
         png = io.BytesIO()
         Image.fromarray(rgb).save(png, "png")
-        sink.image(time_ns, vehicle, png.getvalue(), camera)
+        sink.image(time_ns, vehicle, png.getvalue(), image.head)
 
 
 def _observed(message: Message, states: Array, convention: str, tick_ns: int, sink: Sink) -> None:
