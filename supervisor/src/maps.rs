@@ -47,7 +47,8 @@ pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let map = |map: &CurriculumMap| {
         let (source, scene_files) = match map {
-            CurriculumMap::Town => built_town(install, directory)?,
+            CurriculumMap::Town => built(install, &town::TOWN, directory)?,
+            CurriculumMap::Avenue => built(install, &town::AVENUE, directory)?,
             CurriculumMap::File { path, .. } => user_map(path, directory, config.traffic.trust_scenario)?,
         };
         Ok(RunMap {
@@ -60,9 +61,9 @@ pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec
     config.curriculum.run_maps().iter().map(map).collect()
 }
 
-/// Builds the town. SUMO and the scene use the same files.
-fn built_town(install: &Install, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
-    let (net_file, additional_files) = town::build(install, directory)?;
+/// Builds a map of our own. SUMO and the scene use the same files.
+fn built(install: &Install, map: &town::OwnMap, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+    let (net_file, additional_files) = map.build(install, directory)?;
     let source = Source::Population {
         net_file: net_file.clone(),
         additional_files: additional_files.clone(),

@@ -1,4 +1,4 @@
-//! The town, the project's own map: netconvert builds it in the run directory from plain XML that the program contains.
+//! The project's own maps: netconvert builds them in the run directory from plain XML that the program contains.
 
 use std::{
     path::{Path, PathBuf},
@@ -7,37 +7,50 @@ use std::{
 
 use crate::{failure::Exit, install::Install};
 
-macro_rules! sources {
-    ($($name:literal),+ $(,)?) => { [$(($name, include_str!(concat!("../../maps/town/", $name)))),+] };
+/// A map whose plain sources the program contains.
+#[derive(Debug)]
+pub struct OwnMap {
+    name: &'static str,
+    /// Names and texts of its files.
+    sources: &'static [(&'static str, &'static str)],
 }
 
-/// The plain sources of the town.
-const SOURCES: [(&str, &str); 7] = sources![
-    "town.nod.xml",
-    "town.edg.xml",
-    "town.con.xml",
-    "town.typ.xml",
-    "town.netccfg",
-    "town.poly.xml",
-    "town.vtypes.add.xml",
-];
+macro_rules! own_map {
+    ($map:literal: $($ending:literal),+ $(,)?) => {
+        OwnMap {
+            name: $map,
+            sources: &[$((
+                concat!($map, ".", $ending),
+                include_str!(concat!("../../maps/", $map, "/", $map, ".", $ending)),
+            )),+],
+        }
+    };
+}
 
-/// The one of these files that defines the vehicle types.
+/// The town: one lane in each direction.
+pub const TOWN: OwnMap =
+    own_map!("town": "nod.xml", "edg.xml", "con.xml", "typ.xml", "netccfg", "poly.xml", "vtypes.add.xml");
+
+/// The avenue: a ring of two and three lanes in each direction, and four streets across.
+pub const AVENUE: OwnMap = own_map!("avenue": "nod.xml", "edg.xml", "typ.xml", "netccfg", "poly.xml", "vtypes.add.xml");
+
+/// The file of the town that defines the vehicle types.
 const VEHICLE_TYPES: &str = "town.vtypes.add.xml";
 
-/// Writes the sources of the town to `directory` and builds its net there. Returns the net and its additional files: vehicle types and
-/// polygons.
-///
-/// # Errors
-/// The directory is not writable, or netconvert fails.
-pub fn build(install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBuf>), Exit> {
-    for (name, text) in SOURCES {
-        write(directory, name, text)?;
+impl OwnMap {
+    /// Writes the sources to `directory` and builds the net there. Returns the net and its additional files: vehicle types and polygons.
+    ///
+    /// # Errors
+    /// The directory is not writable, or netconvert fails.
+    pub fn build(&self, install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBuf>), Exit> {
+        for (name, text) in self.sources {
+            write(directory, name, text)?;
+        }
+        let of_map = |ending: &str| directory.join(format!("{}.{ending}", self.name));
+        let net_file = of_map("net.xml");
+        netconvert(install, &of_map("netccfg"), &net_file)?;
+        Ok((net_file, vec![of_map("vtypes.add.xml"), of_map("poly.xml")]))
     }
-    let net_file = directory.join("town.net.xml");
-    netconvert(install, &directory.join("town.netccfg"), &net_file)?;
-    let additional_files = [VEHICLE_TYPES, "town.poly.xml"].map(|name| directory.join(name));
-    Ok((net_file, additional_files.to_vec()))
 }
 
 /// Writes the vehicle types of the town to `directory`, for other maps.
@@ -45,7 +58,7 @@ pub fn build(install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBu
 /// # Errors
 /// The directory is not writable.
 pub fn vehicle_types(directory: &Path) -> Result<PathBuf, Exit> {
-    let source = SOURCES.into_iter().find(|(name, _)| *name == VEHICLE_TYPES);
+    let source = TOWN.sources.iter().find(|(name, _)| *name == VEHICLE_TYPES);
     write(directory, VEHICLE_TYPES, source.map_or("", |(_, text)| text))
 }
 

@@ -23,18 +23,21 @@ pub struct CurriculumConfig {
     pub maps: Vec<CurriculumMap>,
 }
 
-/// The name of the project's own map.
+/// The names of the project's own maps.
 const TOWN: &str = "town";
+const AVENUE: &str = "avenue";
 /// The maps of a run that names none.
 const TOWN_ALONE: &[CurriculumMap] = &[CurriculumMap::Town];
 /// Endings of files that are maps.
 const MAP_ENDINGS: [&str; 4] = [".sumocfg", ".sumo.cfg", ".net.xml", ".net.xml.gz"];
 
-/// A map that stages choose from. Configurations and run files write it as "town" or as a path; stages refer to it by its name.
+/// A map that stages choose from. Configurations and run files write it as "town", "avenue" or as a path; stages refer to it by its name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CurriculumMap {
-    /// The project's own map.
+    /// The project's own map: one lane in each direction.
     Town,
+    /// The project's own map with roads of up to three lanes.
+    Avenue,
     /// A `.net.xml` or a `.sumocfg`.
     File {
         /// The file.
@@ -55,6 +58,7 @@ impl CurriculumMap {
     pub fn name(&self) -> &str {
         match self {
             Self::Town => TOWN,
+            Self::Avenue => AVENUE,
             Self::File { name, .. } => name,
         }
     }
@@ -66,8 +70,10 @@ impl FromStr for CurriculumMap {
     type Err = CurriculumMapError;
 
     fn from_str(text: &str) -> Result<Self, CurriculumMapError> {
-        if text == TOWN {
-            return Ok(Self::Town);
+        match text {
+            TOWN => return Ok(Self::Town),
+            AVENUE => return Ok(Self::Avenue),
+            _ => (),
         }
         let file = text.rsplit_once('/').map_or(text, |(_, file)| file);
         let name = MAP_ENDINGS.iter().find_map(|ending| file.strip_suffix(ending));
@@ -85,6 +91,7 @@ impl fmt::Display for CurriculumMap {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Town => formatter.write_str(TOWN),
+            Self::Avenue => formatter.write_str(AVENUE),
             Self::File { path, .. } => path.display().fmt(formatter),
         }
     }
@@ -220,6 +227,7 @@ mod tests {
     #[test]
     fn a_map_is_the_town_or_a_file_that_is_called_by_its_name() {
         assert_eq!("town".parse(), Ok(CurriculumMap::Town));
+        assert_eq!("avenue".parse(), Ok(CurriculumMap::Avenue));
         for text in [
             "city.net.xml",
             "nets/city.net.xml.gz",

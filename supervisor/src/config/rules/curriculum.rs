@@ -123,7 +123,8 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
         let message = format!("`curriculum.maps` has {} maps", maps.len());
         return refuse(message, &format!("give at most {MOST_MAPS}"));
     }
-    if !maps.is_empty() && config.curriculum.stages.is_empty() {
+    let is_own_alone = matches!(maps.as_slice(), [CurriculumMap::Town | CurriculumMap::Avenue]);
+    if !maps.is_empty() && !is_own_alone && config.curriculum.stages.is_empty() {
         return refuse(
             "`curriculum.maps` are for the stages of a curriculum, and the configuration has no stages".into(),
             "add a [[curriculum.stages]], or set curriculum.maps = []; to run a scenario unchanged, name its .sumocfg in place of the preset",
