@@ -133,11 +133,11 @@ pub fn encode_prediction(
     })
 }
 
-/// Sections, shape and length of an observation with a number of slots.
+/// Sections, shape and length of an observation with a number of slots. Its images, which are too large for a frame, are left out.
 fn observation_layout(header: &MessageHeader) -> impl Fn(usize) -> (Vec<Section>, [u32; DIMENSIONS], usize) {
     let [_, fields, imu_samples] = dimensions(header);
     move |rows| {
-        let layout = ObservationLayout::sized(rows, fields, imu_samples);
+        let layout = ObservationLayout::new(rows, fields, imu_samples);
         (
             layout.named().map(|(_, section)| section).to_vec(),
             layout.shape,

@@ -267,10 +267,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         window: RunFile::window_ticks,
         topics: &["observation"],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| {
-            let (width, imu_samples) = (run.config.observation_width(), run.config.imu_samples());
-            ObservationLayout::new(road_users(run), width, imu_samples).len
-        },
+        max_payload: |run| ObservationLayout::of_run(road_users(run), &run.config).len,
         queue_length: windowful,
         in_hand: |run| two_batches(windowful(run)),
         is_used: |_| true,

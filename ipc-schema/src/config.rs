@@ -104,7 +104,7 @@ impl Config {
     #[must_use]
     pub fn heroes(&self) -> usize {
         match self.task.kind {
-            TaskKind::Localisation => 0,
+            TaskKind::Localisation | TaskKind::Lane => 0,
             TaskKind::Driving => self.traffic.heroes as usize + self.traffic.hero_ids.len(),
         }
     }
@@ -282,6 +282,8 @@ pub enum TaskKind {
     Localisation,
     /// Steering and acceleration of every hero, each in −1 … 1.
     Driving,
+    /// Lane and lateral position in it of every connected vehicle; the world does not listen.
+    Lane,
 }
 
 impl TaskKind {
@@ -291,6 +293,7 @@ impl TaskKind {
         match self {
             Self::Localisation => "localisation",
             Self::Driving => "driving",
+            Self::Lane => "lane",
         }
     }
 }

@@ -102,7 +102,7 @@ impl From<PolicyMetric> for &'static str {
 }
 
 /// Every metric, in the order of [`MetricValues`]. The first metric of a task is its headline.
-pub const METRICS: [MetricSpec; 4] = [
+pub const METRICS: [MetricSpec; 8] = [
     MetricSpec {
         name: "error_m",
         label: "error",
@@ -134,6 +134,38 @@ pub const METRICS: [MetricSpec; 4] = [
         direction: MetricDirection::LowerIsBetter,
         task: TaskKind::Driving,
         reference_for: None,
+    },
+    MetricSpec {
+        name: "lateral_error_m",
+        label: "lateral error",
+        unit: "m",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Lane,
+        reference_for: None,
+    },
+    MetricSpec {
+        name: "wrong_lane_percent",
+        label: "wrong lane",
+        unit: "%",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Lane,
+        reference_for: None,
+    },
+    MetricSpec {
+        name: "raw_gnss_lateral_error_m",
+        label: "raw GNSS",
+        unit: "m",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Lane,
+        reference_for: Some("lateral_error_m"),
+    },
+    MetricSpec {
+        name: "raw_gnss_wrong_lane_percent",
+        label: "raw GNSS",
+        unit: "%",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Lane,
+        reference_for: Some("wrong_lane_percent"),
     },
 ];
 
@@ -181,6 +213,7 @@ pub fn headline(task: TaskKind) -> &'static MetricSpec {
     match task {
         TaskKind::Localisation => &METRICS[0],
         TaskKind::Driving => &METRICS[2],
+        TaskKind::Lane => &METRICS[4],
     }
 }
 
@@ -217,14 +250,14 @@ mod tests {
     fn names_are_unique_and_end_in_their_unit() {
         for (place, metric) in METRICS.iter().enumerate() {
             assert_eq!(place_of(metric.name), Some(place), "{}", metric.name);
-            let unit = metric.unit.replace('/', "p");
+            let unit = metric.unit.replace('/', "p").replace('%', "percent");
             assert!(metric.name.ends_with(&format!("_{unit}")), "{}", metric.name);
         }
     }
 
     #[test]
     fn the_headline_is_the_first_metric_of_its_task() {
-        for task in [TaskKind::Localisation, TaskKind::Driving] {
+        for task in [TaskKind::Localisation, TaskKind::Driving, TaskKind::Lane] {
             let first = METRICS.iter().find(|metric| metric.task == task).unwrap();
             assert_eq!(headline(task), first);
         }

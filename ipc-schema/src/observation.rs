@@ -1,6 +1,6 @@
 //! `observation`: what every connected vehicle senses at a tick, one row for each slot.
 
-use crate::{section::payload_layout, world};
+use crate::{config::Config, section::payload_layout, world};
 
 /// `vehicle` value of an empty slot.
 pub const EMPTY_SLOT: u32 = u32::MAX;
@@ -71,10 +71,10 @@ pub const fn end_bits(hero_ends: u32) -> u32 {
 }
 
 payload_layout! {
-    /// Layout of an `observation` message for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
+    /// Layout of an `observation` message for `n` slots, `d` numbers in a row, `k` IMU samples in a tick and so many bytes of images.
     ///
     /// A slot belongs to one vehicle until that vehicle leaves; `n` never shrinks within a run.
-    ObservationLayout(slots, fields, imu_samples) => ObservationSections {
+    ObservationLayout(slots, fields, imu_samples, image_bytes) => ObservationSections {
         /// `f32 [n, d]`: normalised observation; with a history, the ticks in order, the newest last.
         observation: f32, [slots, fields];
         /// `f32 [n, 4]`: ground truth ([`TRUTH_COLUMNS`]), never part of the observation.
@@ -104,13 +104,23 @@ payload_layout! {
         /// `f32 [n, 4]`: age of the newest sample of each of the first sensors ([`AGE_COLUMNS`]), by
         /// [`crate::sensor::SensorKind`], seconds; 0 for a sensor that the carrier lacks.
         age_s: [f32; AGE_COLUMNS], [slots];
+        /// `u8 [m, h, w, c]`: the newest image of each of the first m slots (`camera.observed`); empty in a run without images in its
+        /// observations.
+        images: u8, [image_bytes];
     }
 }
 
 impl ObservationLayout {
-    /// Layout for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
+    /// Layout for `n` slots, `d` numbers in a row and `k` IMU samples in a tick, without images.
     #[must_use]
     pub fn new(n: usize, d: usize, k: usize) -> Self {
-        Self::sized(n, d, k)
+        Self::sized(n, d, k, 0)
+    }
+
+    /// Layout for `n` slots of a run with this configuration.
+    #[must_use]
+    pub fn of_run(n: usize, config: &Config) -> Self {
+        let images = n.min(config.camera.vehicles as usize) * config.camera.observed_bytes();
+        Self::sized(n, config.observation_width(), config.imu_samples(), images)
     }
 }

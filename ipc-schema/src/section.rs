@@ -171,10 +171,11 @@ mod tests {
             "fields" => 9,
             _ => 3,
         };
-        let layout = ObservationLayout::sized(5, 9, 3);
+        let layout = ObservationLayout::sized(5, 9, 3, 3);
         for (spec, (name, section)) in ObservationLayout::SECTIONS.iter().zip(layout.named()) {
             let scalar = match (spec.element)().0.as_str() {
                 "<f8" | "<u8" => 8,
+                "|u1" => 1,
                 _ => 4,
             };
             assert_eq!(spec.name, name);

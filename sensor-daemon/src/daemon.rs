@@ -192,7 +192,7 @@ impl Daemon {
                 return Ok(Wait::Stopped);
             }
         }
-        let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
+        let len = ObservationLayout::of_run(n, &self.membership.run.config).len;
         let waited = self
             .observations
             .wait_for_credit(&mut self.membership, world.tick, len)?;
@@ -216,7 +216,7 @@ impl Daemon {
 
     /// Samples the sensors into a block of shared memory, adds it to the hash, and sends it or keeps it in the journal.
     fn publish(&mut self, world: &MessageHeader, road_users: &WorldTick, n: usize) -> Result<(), Failure> {
-        let layout = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples());
+        let layout = ObservationLayout::of_run(n, &self.membership.run.config);
         let ours = self.membership.header();
         let header = MessageHeader {
             run_id: ours.run_id,
@@ -229,6 +229,10 @@ impl Daemon {
         self.sensing
             .observe(&header, road_users, draft.payload_mut())
             .map_err(unreadable)?;
+        if layout.images.len > 0 {
+            let images = block::view_mut(draft.payload_mut(), layout.images).map_err(unreadable)?;
+            self.surroundings.write_images(&self.sensing, images);
+        }
         self.digest.add(&header, draft.payload());
         // Stored before the tick is sent: a process that has received the last tick of an episode can rely on the state of the next one.
         if header.has(LAST_OF_EPISODE) {

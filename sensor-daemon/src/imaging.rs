@@ -4,10 +4,11 @@ use std::{collections::BTreeMap, mem::offset_of, sync::Arc};
 
 use ipc_schema::{
     block,
-    config::{Config, OWN_SENSOR},
+    config::{BlackoutPolicy, Config, OWN_SENSOR},
     failure::{Failure, FailureKind},
     header::MessageHeader,
     image::{ImageHead, ImageLayout, ImagePlane, MOST_SEEN, SeenObject},
+    observation::EMPTY_SLOT,
     ports::Publisher,
     sensor::SensorKind,
     world::{SubStep, VehicleState},
@@ -59,6 +60,8 @@ pub struct CameraImaging {
     objects: Vec<SeenObject>,
     due: Vec<DueUnit>,
     publisher: Publisher,
+    /// Images that stand in observations; `None` where none do.
+    observed: Option<ObservedImages>,
     totals: MessageTotals,
 }
 
@@ -69,6 +72,66 @@ struct NumberedCamera {
     planes: u32,
     range_m: f32,
     plane_bytes: usize,
+}
+
+/// The newest image of each slot that carries a camera, as the observation has them.
+struct ObservedImages {
+    plane: ImagePlane,
+    /// Slots that may carry a camera: the first.
+    carriers: usize,
+    image_bytes: usize,
+    /// Images are 0 while their camera is dark (`blackout.policy`).
+    dark_is_blank: bool,
+    newest: Vec<u8>,
+}
+
+impl ObservedImages {
+    fn new(config: &Config) -> Option<Self> {
+        let plane = config.camera.observed.plane()?;
+        Some(Self {
+            plane,
+            carriers: config.camera.vehicles as usize,
+            image_bytes: config.camera.observed_bytes(),
+            dark_is_blank: config.blackout.policy == BlackoutPolicy::Nan,
+            newest: Vec::new(),
+        })
+    }
+
+    /// Makes room for the slots of a tick, and clears those in which no trajectory continues.
+    fn begin_tick(&mut self, sensing: &Sensing) {
+        let slots = sensing.slots();
+        self.newest.resize(slots.len().min(self.carriers) * self.image_bytes, 0);
+        for (image, slot) in self.newest.chunks_exact_mut(self.image_bytes).zip(slots) {
+            if slot.vehicle == EMPTY_SLOT || slot.step == 0 {
+                image.fill(0);
+            }
+        }
+    }
+
+    /// Keeps the image of a slot.
+    fn keep(&mut self, slot: usize, planes: &ImagePlanes) {
+        let plane: &[u8] = match self.plane {
+            ImagePlane::Semantic => planes.semantic,
+            ImagePlane::Rgb => bytemuck::cast_slice(planes.rgb),
+            ImagePlane::Binary => planes.binary,
+            // No configuration observes these.
+            ImagePlane::Depth | ImagePlane::Instance => return,
+        };
+        let first = slot * self.image_bytes;
+        if let Some(place) = self.newest.get_mut(first..first + self.image_bytes) {
+            place.copy_from_slice(plane);
+        }
+    }
+
+    /// Writes the images of all slots of the tick to a section of zeros.
+    fn write(&self, sensing: &Sensing, section: &mut [u8]) {
+        let places = section.chunks_exact_mut(self.image_bytes);
+        for (slot, (place, image)) in places.zip(self.newest.chunks_exact(self.image_bytes)).enumerate() {
+            if !self.dark_is_blank || sensing.delivers(slot, SensorKind::Camera) {
+                place.copy_from_slice(image);
+            }
+        }
+    }
 }
 
 impl CameraImaging {
@@ -98,6 +161,7 @@ impl CameraImaging {
             objects: Vec::new(),
             due: Vec::new(),
             publisher,
+            observed: ObservedImages::new(config),
             totals: MessageTotals::default(),
         }
     }
@@ -124,6 +188,9 @@ impl CameraImaging {
         beside: &RoadsideCarriers,
         sensing: &Sensing,
     ) -> Result<(), Failure> {
+        if let Some(observed) = &mut self.observed {
+            observed.begin_tick(sensing);
+        }
         let mut due = std::mem::take(&mut self.due);
         sensing.units_due(SensorKind::Camera, &mut due);
         beside.add_due(SensorKind::Camera, sensing.now(header).tick, states.len(), &mut due);
@@ -145,6 +212,13 @@ impl CameraImaging {
         Ok(())
     }
 
+    /// Writes the newest images of all slots to the section of the observation of this tick, which is 0.
+    pub fn write_observed(&self, sensing: &Sensing, section: &mut [u8]) {
+        if let Some(observed) = &self.observed {
+            observed.write(sensing, section);
+        }
+    }
+
     fn take_one(&mut self, header: &MessageHeader, carrier: &VehicleState, unit: &DueUnit) -> Result<(), Failure> {
         let Some(numbered) = self.cameras.get(&unit.sensor) else {
             return Ok(());
@@ -161,6 +235,9 @@ impl CameraImaging {
         let mut planes_of = split_planes(planes, numbered.planes, width * height);
         let (seen, scratch) = (&self.seen, &mut self.scratch);
         camera.take(seen, Some(unit.row), &pose, scratch, &mut planes_of, &mut self.objects);
+        if let (Some(observed), Some(slot), OWN_SENSOR) = (&mut self.observed, unit.slot, unit.sensor) {
+            observed.keep(slot, &planes_of);
+        }
         self.objects.truncate(MOST_SEEN);
         let objects: &[u8] = bytemuck::cast_slice(&self.objects);
         listed[..objects.len()].copy_from_slice(objects);

@@ -20,7 +20,7 @@ use crate::{
     noise::{DrawnNormals, NormalDraws},
     observation::fields::{Normaliser, SensorReadings},
     observation::history::{FrameHistory, TrajectoryFrame},
-    observation::slots::Slots,
+    observation::slots::{Slot, Slots},
     region::SensedRegion,
     sensors::gnss::SatelliteSky,
     suite::SensorSuite,
@@ -356,6 +356,19 @@ impl Sensing {
             }
             _ => None,
         })
+    }
+
+    /// The slots of the last [`Sensing::assign`].
+    #[must_use]
+    pub fn slots(&self) -> &[Slot] {
+        self.slots.rows()
+    }
+
+    /// True if `sensor` of the carrier in `slot` delivered at the last [`Sensing::observe`].
+    #[must_use]
+    pub fn delivers(&self, slot: usize, sensor: SensorKind) -> bool {
+        let carrier = self.carriers.get(slot);
+        carrier.is_some_and(|carrier| sensor.is_in(carrier.readings.delivering))
     }
 
     /// The newest samples of the carrier in `slot`, for sensors of the surroundings. Call it between [`Sensing::assign`] and

@@ -120,6 +120,13 @@ impl Surroundings {
         Ok(())
     }
 
+    /// Writes the newest images to the section of an observation that holds them, which is 0.
+    pub fn write_images(&self, sensing: &Sensing, section: &mut [u8]) {
+        if let Some(cameras) = &self.cameras {
+            cameras.write_observed(sensing, section);
+        }
+    }
+
     /// Continues counting LIDAR scans from `totals`.
     pub fn set_lidar_totals(&mut self, totals: Option<ScanTotals>) {
         if let (Some(lidars), Some(totals)) = (&mut self.lidars, totals) {

@@ -561,8 +561,9 @@ impl Attachment {
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
         let mut inner = self.lock()?;
         let mut blocks = Vec::new();
+        let image_shape = inner.membership.run.config.camera.observed_shape();
         while let Some(messages) = inner.next_message()? {
-            blocks.push(ObservationBlock::new(messages)?);
+            blocks.push(ObservationBlock::new(messages, image_shape)?);
         }
         Ok(blocks)
     }
@@ -625,6 +626,8 @@ struct ObservationBlock {
     /// Keeps the payload from being overwritten. Never locked: a message is Send but not Sync, Python wants both.
     _message: Mutex<Message>,
     neighbours: Option<NeighboursBlock>,
+    /// Rows, columns and bytes of a pixel of the images in an observation.
+    image_shape: Option<[usize; 3]>,
 }
 
 /// The neighbours of a tick in shared memory.
@@ -681,7 +684,7 @@ fn section_of<const N: usize>(
 }
 
 impl ObservationBlock {
-    fn new(messages: TickMessages) -> PyResult<Self> {
+    fn new(messages: TickMessages, image_shape: Option<[usize; 3]>) -> PyResult<Self> {
         let received_ns = monotonic_ns();
         let TickMessages {
             observation: message,
@@ -697,6 +700,7 @@ impl ObservationBlock {
             payload_address,
             _message: Mutex::new(message),
             neighbours: neighbours.map(NeighboursBlock::new).transpose()?,
+            image_shape,
         })
     }
 }
@@ -737,6 +741,12 @@ impl ObservationBlock {
     #[getter]
     fn imu_samples(&self) -> u32 {
         self.header.shape[2]
+    }
+
+    /// Rows, columns and bytes of a pixel of the images in the section "images"; `None` in a run whose observations hold none.
+    #[getter]
+    fn image_shape(&self) -> Option<(usize, usize, usize)> {
+        self.image_shape.map(|[rows, columns, bytes]| (rows, columns, bytes))
     }
 
     /// True in an evaluation episode.

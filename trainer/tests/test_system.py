@@ -114,3 +114,20 @@ def test_what_arrived_belongs_to_the_observation_and_comes_again_to_a_successor(
     report = json.loads((run / "report.json").read_text())
     assert report["v2x"]["redelivered_ticks"] >= 1
     assert report["v2x"]["cams"] > 100
+
+
+def test_images_belong_to_the_observation_and_come_again_to_a_successor(tmp_path: Path) -> None:
+    more: dict[str, object] = {"camera.vehicles": 5, "camera.observed": "semantic", "camera.width": 40}
+    more |= {"camera.height": 24, "traffic.cavs": 8, "episode.training_episodes": 2}
+    finished = run_with(tmp_path, "images_probe", more)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    run = tmp_path / "runs" / "probe"
+    found = json.loads((run / "parts" / "trainer.json").read_text())
+    # The first trainer committed tick 50 and died at tick 80.
+    assert (found["first_tick"], found["last_tick"]) == (51, 2 * 100 + 20 - 1)
+    assert found["consecutive"]
+    assert (found["again"], found["different"]) == (30, 0)
+    assert found["shape"] == [5, 1, 24, 40]
+    assert found["shown"] == found["valid"] > 500
+    # Watchers may miss images; those that they get are the same.
+    assert found["watched"] > 20 and found["unlike"] == 0

@@ -16,6 +16,7 @@ from caraware.ipc.arrays import BoolArray
 from caraware.ipc.run_file import ConfigError, RunFile
 from caraware.tasks.contract import EndKind, Sampling, Task, TaskOutcome, TaskRows, TaskStep
 from caraware.tasks.driving import Driving, OutcomeMissingError
+from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
 from caraware.tasks.metrics import reference_names
 from caraware.tasks.table import TASKS, task_of_run
@@ -31,6 +32,7 @@ def run_of(task: str) -> RunFile:
     config = {
         "run": {"tick_s": 0.1, "window_ticks": 16},
         "task": {"kind": task},
+        "curriculum": {"maps": []},
         "traffic": {"cavs": ROWS, "heroes": ROWS, "hero_ids": [], "pedestrians": 0},
         "episode": {"ticks": 100},
         "observation": observation,
@@ -45,6 +47,7 @@ def run_of(task: str) -> RunFile:
     return {
         "config": config,
         "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]},
+        "scene_files": {"net_file": str(Path(__file__).parent / "two_lanes.net.xml")},
         "source": {"population": {}},
         "observation_fields": fields,
     }
@@ -77,7 +80,7 @@ def task(request: pytest.FixtureRequest) -> Task:
 
 
 def test_a_task_has_the_name_of_its_row_and_metrics_of_its_own(task: Task) -> None:
-    assert isinstance(task, {"localisation": Localisation, "driving": Driving}[task.name])
+    assert isinstance(task, {"localisation": Localisation, "driving": Driving, "lane": LanePosition}[task.name])
     assert task.metrics and {metric.task for metric in task.metrics} == {task.name}
     assert task.metrics[0].reference_for is None
     assert {metric.name for metric in _native.METRICS if metric.task == task.name} == {m.name for m in task.metrics}
@@ -198,4 +201,4 @@ def test_the_ends_of_driving_are_as_documented() -> None:
 def test_an_unknown_task_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="no task is called 'parking'") as refused:
         task_of_run(run_of("parking"))
-    assert refused.value.help == "`task.kind` is one of: localisation, driving"
+    assert refused.value.help == "`task.kind` is one of: localisation, driving, lane"

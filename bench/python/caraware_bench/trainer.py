@@ -117,6 +117,7 @@ def learner_config(
         hidden=(500, 300),
         activation=HiddenActivation.RELU,
         truncation_ticks=32,
+        frames=4,
         supervised=False,
         reward=RewardName.BOUNDED_INVERSE,
         reward_scale_m=5.0,
@@ -129,6 +130,7 @@ def learner_config(
         checkpoints_kept=5,
         checkpoint_keep_every=0,
         estimates=EstimateTimes.NEVER,
+        images=None,
     )
 
 

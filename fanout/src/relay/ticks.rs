@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 use ipc_schema::{
+    config::TaskKind,
     header::MessageHeader,
     membership::{MembershipError, RunMembership},
     ports::PortError,
@@ -69,7 +70,7 @@ impl TickTopics {
             streams,
             newest: MessageHeader::default(),
             figures: TickFigures::default(),
-            predicts_positions: !membership.run.config.drives(),
+            predicts_positions: membership.run.config.task.kind == TaskKind::Localisation,
             apart_since: None,
         })
     }

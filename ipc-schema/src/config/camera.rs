@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::image::ImagePlane;
+
 /// The camera of a vehicle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -31,13 +33,56 @@ pub struct CameraConfig {
     pub rgb: bool,
     /// Images have what is of interest in white.
     pub binary: bool,
+    /// The plane that observations have of each image.
+    pub observed: ObservedPlane,
     /// Length of a blackout, shortest and longest, seconds; [0, 0] = none.
     pub blackout_length_s: [f64; 2],
     /// Time between two blackouts, shortest and longest, seconds.
     pub blackout_gap_s: [f64; 2],
 }
 
+/// The plane of the newest image that stands in the observation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ObservedPlane {
+    /// None: observations hold no images.
+    #[default]
+    None,
+    /// Classes.
+    Semantic,
+    /// Colours.
+    Rgb,
+    /// What is of interest in white.
+    Binary,
+}
+
+impl ObservedPlane {
+    /// The plane of an image; `None` where observations hold no images.
+    #[must_use]
+    pub const fn plane(self) -> Option<ImagePlane> {
+        match self {
+            Self::None => None,
+            Self::Semantic => Some(ImagePlane::Semantic),
+            Self::Rgb => Some(ImagePlane::Rgb),
+            Self::Binary => Some(ImagePlane::Binary),
+        }
+    }
+}
+
 impl CameraConfig {
+    /// Bytes of the image of one slot in an observation.
+    #[must_use]
+    pub fn observed_bytes(&self) -> usize {
+        self.observed.plane().map_or(0, ImagePlane::pixel_bytes) * self.pixels()
+    }
+
+    /// Rows, columns and bytes of a pixel of the images in observations; `None` where they hold none.
+    #[must_use]
+    pub fn observed_shape(&self) -> Option<[usize; 3]> {
+        let plane = self.observed.plane().filter(|_| self.vehicles > 0)?;
+        Some([self.height as usize, self.width as usize, plane.pixel_bytes()])
+    }
+
     /// Pixels of an image.
     #[must_use]
     pub fn pixels(&self) -> usize {

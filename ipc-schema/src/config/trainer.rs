@@ -56,6 +56,8 @@ pub struct TrainerConfig {
     pub activation: Activation,
     /// Ticks that a gradient reaches back in a network with memory.
     pub truncation_ticks: u64,
+    /// Images in a stack that a network sees.
+    pub frames: u64,
     /// Train a network of the policy's size by regression beside it.
     pub supervised: bool,
     /// The trainer reads the channel `world` beside its observations.
@@ -123,6 +125,8 @@ pub enum Network {
     Mlp,
     /// The last hidden layer is a gated recurrent unit, with a state for each slot.
     Gru,
+    /// Convolutions over a stack of images, then the hidden layers.
+    Cnn,
     /// A class of the user's.
     Class(PythonClass),
 }
@@ -161,6 +165,7 @@ impl FromStr for Network {
         match text {
             "mlp" => Ok(Self::Mlp),
             "gru" => Ok(Self::Gru),
+            "cnn" => Ok(Self::Cnn),
             _ => PythonClass::parse(text)
                 .map(Self::Class)
                 .ok_or_else(|| TrainerNetworkError(text.to_owned())),
@@ -173,6 +178,7 @@ impl fmt::Display for Network {
         match self {
             Self::Mlp => formatter.write_str("mlp"),
             Self::Gru => formatter.write_str("gru"),
+            Self::Cnn => formatter.write_str("cnn"),
             Self::Class(PythonClass { module, class }) => write!(formatter, "{module}:{class}"),
         }
     }
@@ -227,7 +233,7 @@ mod tests {
                 class: "Deep2".into()
             })
         );
-        for text in ["mlp", "gru", "my_package.nets:Deep2"] {
+        for text in ["mlp", "gru", "cnn", "my_package.nets:Deep2"] {
             assert_eq!(text.parse::<Network>().unwrap().to_string(), text);
         }
         for text in ["", "mlpp", "nets.Deep", "nets:", ":Deep", "nets:2Deep", "a..b:C"] {

@@ -220,6 +220,13 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
         ));
     }
     let draws_actions = config.trainer.module == OWN_TRAINER && config.task.driver == HeroDriver::Actions;
+    if draws_actions && config.trainer.network == Network::Cnn {
+        return Some((
+            "trainer.network",
+            "`trainer.network` = \"cnn\" does not drive: its actions would be drawn without its images".into(),
+            "set trainer.network = \"mlp\" or a class",
+        ));
+    }
     if draws_actions && config.trainer.network == Network::Gru {
         return Some((
             "trainer.network",

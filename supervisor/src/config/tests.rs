@@ -227,7 +227,7 @@ fn networks_and_activations_are_known_by_name() {
     for unknown in ["lstm", ":Wide", "networks:", "my networks:Wide", "networks:Wide:er"] {
         let (_, help) = error_of(&format!("trainer.network = \"{unknown}\"\n"));
         assert!(
-            help.contains("\"mlp\", \"gru\", \"package.module:Class\""),
+            help.contains("\"mlp\", \"gru\", \"cnn\", \"package.module:Class\""),
             "{unknown}: {help}"
         );
     }

@@ -66,9 +66,9 @@ impl TextForm {
             ),
             Self::Corner => "\"x y\" such as \"120 45.5\"".into(),
             Self::Endpoint => "\"tcp/HOST:PORT\", \"tls/HOST:PORT\" such as \"tcp/127.0.0.1:7447\"".into(),
-            Self::Map => "\"town\", a .net.xml (or .net.xml.gz), a .sumocfg".into(),
+            Self::Map => "\"town\", \"avenue\", a .net.xml (or .net.xml.gz), a .sumocfg".into(),
             Self::Mesh => "\"file.obj x y\", \"file.obj x y heading\" such as \"house.obj 120.5 80 90\"".into(),
-            Self::Network => "\"mlp\", \"gru\", \"package.module:Class\"".into(),
+            Self::Network => "\"mlp\", \"gru\", \"cnn\", \"package.module:Class\"".into(),
             Self::Obstacle => format!(
                 "\"name x y\", \"name x y heading\" such as \"cone 120.5 80 90\"; props: {}",
                 prop_names()

@@ -236,6 +236,10 @@ class ObservationBlock:
         """Number of IMU samples k."""
 
     @property
+    def image_shape(self) -> tuple[int, int, int] | None:
+        """Rows, columns and bytes of a pixel of the images in the section `images`; None where there are none."""
+
+    @property
     def evaluation(self) -> bool:
         """True in an evaluation episode."""
 

@@ -123,7 +123,8 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
         let message = format!("`curriculum.maps` has {} maps", maps.len());
         return refuse(message, &format!("give at most {MOST_MAPS}"));
     }
-    let is_own_alone = matches!(maps.as_slice(), [CurriculumMap::Town | CurriculumMap::Avenue]);
+    // The avenue alone is the map of the whole run; the town is so without being named.
+    let is_own_alone = matches!(maps.as_slice(), [CurriculumMap::Avenue]);
     if !maps.is_empty() && !is_own_alone && config.curriculum.stages.is_empty() {
         return refuse(
             "`curriculum.maps` are for the stages of a curriculum, and the configuration has no stages".into(),

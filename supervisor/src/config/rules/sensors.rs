@@ -1,7 +1,8 @@
 //! Rules of the sensors: rates divide each other, fields of view are not empty, and every observation field has its sensor.
 
 use ipc_schema::{
-    config::{Config, LidarConfig, LidarPattern},
+    config::{Config, LidarConfig, LidarPattern, Network},
+    image::ImagePlane,
     sensor::{SENSORS, SensorKind, fitted_sensors},
 };
 
@@ -9,7 +10,10 @@ use super::{ConfigError, LayeredSettings, conflict, is_multiple};
 
 /// Checks the sensors.
 pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
-    let refused = imu(config).or_else(|| lidar(config)).or_else(|| observation(config));
+    let refused = imu(config)
+        .or_else(|| lidar(config))
+        .or_else(|| observed_plane(config))
+        .or_else(|| observation(config));
     match refused {
         None => Ok(()),
         Some((path, message, help)) => Err(conflict(settings, path, message, help)),
@@ -45,6 +49,41 @@ fn imu(config: &Config) -> Option<BrokenSensorRule> {
                  that is a whole number of sub-steps of {sub_step_s} s"
             ),
             format!("choose {tick_s} s, a multiple of it, or a part such as {sub_step_s} s; or another `run.sub_steps`"),
+        )
+    })
+}
+
+/// Observations hold a plane that images have, of cameras that some vehicle carries; a network that sees needs both.
+fn observed_plane(config: &Config) -> Option<BrokenSensorRule> {
+    let (camera, sees) = (&config.camera, config.trainer.network == Network::Cnn);
+    let Some(plane) = camera.observed.plane() else {
+        return sees.then(|| {
+            (
+                "trainer.network",
+                "`trainer.network` = \"cnn\", but observations hold no images".into(),
+                "set camera.observed = \"semantic\", and camera.vehicles to the number of vehicles that learn".into(),
+            )
+        });
+    };
+    if camera.vehicles == 0 {
+        return Some((
+            "camera.observed",
+            "`camera.observed` without a camera: `camera.vehicles` = 0".into(),
+            "set camera.vehicles to the number of vehicles that learn, or camera.observed = \"none\"".into(),
+        ));
+    }
+    let name = match plane {
+        ImagePlane::Depth => "depth",
+        ImagePlane::Instance => "instance",
+        ImagePlane::Semantic => "semantic",
+        ImagePlane::Rgb => "rgb",
+        ImagePlane::Binary => "binary",
+    };
+    (ImagePlane::wanted(camera) & plane.bit() == 0).then(|| {
+        (
+            "camera.observed",
+            format!("`camera.observed` = \"{name}\", but images have no such plane: `camera.{name}` = false"),
+            format!("set camera.{name} = true, or camera.observed = \"none\""),
         )
     })
 }

@@ -159,6 +159,19 @@ class Observation:
         return read_only_tensor(self._array("observation", np.float32))
 
     @cached_property
+    def images(self) -> Tensor:
+        """u8 [m, channels, height, width]: the newest image of each of the first m slots (`camera.observed`).
+
+        m is the smaller of n and `camera.vehicles`; an image is 0 until the camera of its slot has delivered. Raises
+        RuntimeError in a run whose observations hold no images.
+        """
+        shape = self.block.image_shape
+        if shape is None:
+            raise RuntimeError("no images in the observations of this run: set `camera.observed`")
+        rows = self._array("images", np.uint8).reshape(-1, *shape)
+        return read_only_tensor(rows).permute(0, 3, 1, 2)
+
+    @cached_property
     def neighbours(self) -> Neighbours:
         """What the slots know from messages. Its arrays raise RuntimeError in a run without them (`v2x.share`)."""
         return Neighbours(self.block)

@@ -12,6 +12,7 @@ from caraware import _native
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.layout import record
 from caraware.ipc.mounts import MountedSensor, SensorNames
+from caraware.ipc.run_file import RunFile
 
 IMAGE = record("ImageHead")
 """`ImageHead`: the camera in the world at the end of the tick (m; roll, pitch, heading in rad), and its setup."""
@@ -56,6 +57,33 @@ PLANES: tuple[tuple[str, str, tuple[int, ...]], ...] = (
     ("binary", "|u1", ()),
 )
 """Name, scalar and shape of a pixel of each plane, in the order in which a message has them; its place is its bit."""
+
+
+@dataclass(frozen=True)
+class ImageShape:
+    """The images in observations (`camera.observed`)."""
+
+    plane: str
+    """Name of the plane: "semantic", "rgb" or "binary"."""
+    channels: int
+    """3 of "rgb", else 1."""
+    height: int
+    width: int
+
+    @classmethod
+    def from_run(cls, run: RunFile) -> "ImageShape | None":
+        """Of the observations of a run; None where they hold no images."""
+        camera = run["config"].get("camera") or {}
+        plane = str(camera.get("observed", "none"))
+        if plane == "none" or int(camera["vehicles"]) == 0:
+            return None
+        shape = next(shape for name, _, shape in PLANES if name == plane)
+        return cls(plane, math.prod(shape), int(camera["height"]), int(camera["width"]))
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Channels, height, width."""
+        return self.channels, self.height, self.width
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """What the trainer needs of a stream of observations; `caraware.ipc.channel` provides it over shared memory."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import Any, Protocol, TypedDict, Unpack, runtime_checkable
 
 from torch import Tensor
 
@@ -57,6 +57,15 @@ class LearningTick(MeasuredTick, Protocol):
     @property
     def ended_by(self) -> UInt32Array:
         """u32 `[n]`: bits `ENDED_…` of `caraware._native`: why a hero's trajectory ended there; 0 for others."""
+
+
+@runtime_checkable
+class SeeingTick(Protocol):
+    """What a learner that sees takes of a tick beside the rest."""
+
+    @property
+    def images(self) -> Tensor:
+        """u8 `[m, channels, height, width]`: the newest image of each of the first m slots."""
 
 
 class Observation(LearningTick, Protocol):

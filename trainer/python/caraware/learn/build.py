@@ -1,8 +1,9 @@
 """A learner as the configuration says: its networks, and the update that is the fastest for them.
 
-`"mlp"` and `"gru"` are the paper's networks and the one with memory. `"package.module:Class"` names any other: it is
-constructed as `Class(inputs, outputs, hidden)`, with the widths of `trainer.hidden`, and maps rows `[b, inputs]` to
-`[b, outputs]`. PPO makes two of it: the policy's mean, which is bounded to the map by a tanh behind it, and the values.
+`"mlp"`, `"gru"` and `"cnn"` are the paper's networks, the one with memory and the one that sees.
+`"package.module:Class"` names any other: it is constructed as `Class(inputs, outputs, hidden)`, with the widths of
+`trainer.hidden`, and maps rows `[b, inputs]` to `[b, outputs]`. PPO makes two of it: the policy's mean, which is
+bounded to the map by a tanh behind it, and the values.
 """
 
 import math
@@ -13,6 +14,7 @@ import torch
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from caraware.learn.cnn import mean_network
 from caraware.learn.config import (
     BuiltInNetwork,
     ConfigError,
@@ -31,6 +33,7 @@ from caraware.learn.ppo import PlainUpdate, Ppo
 from caraware.learn.ranked import RankedUpdate
 from caraware.learn.ranks import Ranks
 from caraware.learn.recurrent import RecurrentPpo, SequenceUpdate
+from caraware.learn.seeing import SeeingPpo, SeeingUpdate
 from caraware.tasks.contract import Sampling, Task
 
 NetworkClass = Callable[[int, int, tuple[int, ...]], nn.Module]
@@ -56,6 +59,8 @@ def build_ppo(
     if config.network is BuiltInNetwork.GRU:
         sequences = _sequence_update(config, observation_size, actions, device, sampling, ranks)
         return RecurrentPpo(config, task, observation_size, sequences, sampling, environments)
+    if config.network is BuiltInNetwork.CNN:
+        return _seeing_ppo(config, observation_size, task, device, sampling, environments, ranks)
     if config.network is BuiltInNetwork.MLP:
         policy, value = paper_networks(config, observation_size, actions, sampling)
         _spread(policy, task)
@@ -68,6 +73,36 @@ def build_ppo(
         _refuse_batch_statistics(config, own_policy, own_value)
         plain = RankedUpdate(config, own_policy, own_value, device, ranks)
     return Ppo(config, task, observation_size, plain, sampling, environments)
+
+
+def _seeing_ppo(
+    config: TrainerConfig,
+    observation_size: int,
+    task: Task,
+    device: torch.device,
+    sampling: torch.Generator,
+    environments: Sequence[int],
+    ranks: Ranks | None,
+) -> SeeingPpo:
+    """A policy that sees, and a value network that does not. Raises `ConfigError`."""
+    if task.sampling is Sampling.EACH_TICK:
+        raise ConfigError(
+            f"`trainer.network` = 'cnn' with `task.kind` = {task.name!r}",
+            'actions that are drawn tick by tick need a network of fields alone: "mlp" or a class',
+        )
+    if ranks is not None and ranks.size > 1:
+        raise ConfigError(
+            f"`trainer.network` = 'cnn' with `trainer.ranks` = {config.ranks}",
+            'trainers that learn together exchange no images: set trainer.ranks = 1, or trainer.network = "mlp"',
+        )
+    seed = int(torch.randint(2**62, (), generator=sampling))
+    mean = mean_network(config, observation_size, task.actions.size, seed)
+    value = value_mlp(observation_size, config.hidden, Activation(config.activation))
+    value.initialise(sampling)
+    policy = GaussianPolicy(mean, task.actions.size, config.initial_std)
+    _spread(policy, task)
+    update = SeeingUpdate(config, policy, value, device)
+    return SeeingPpo(config, task, observation_size, update, sampling, environments)
 
 
 def _spread(policy: GaussianPolicy, task: Task) -> None:
@@ -144,7 +179,7 @@ def _refuse_batch_statistics(config: TrainerConfig, *networks: nn.Module) -> Non
 
 def _class_of(network: PythonClass) -> NetworkClass:
     """The class itself. Raises `ConfigError`."""
-    help = "write `mlp`, `gru` or `package.module:Class`; the module must be in PYTHONPATH"
+    help = "write `mlp`, `gru`, `cnn` or `package.module:Class`; the module must be in PYTHONPATH"
     try:
         network_class: NetworkClass = getattr(import_module(network.module), network.name)
         return network_class

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
+from caraware.ipc.image import ImageShape
 from caraware.ipc.run_file import ConfigError as ConfigError
 from caraware.ipc.run_file import ConfigTable, RunFile, config_table, setting, typed
 from caraware.tasks.bounds import MapBounds as MapBounds
@@ -20,6 +21,8 @@ class BuiltInNetwork(StrEnum):
     MLP = "mlp"
     GRU = "gru"
     """Remembers the ticks before."""
+    CNN = "cnn"
+    """Sees images of the newest ticks."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +113,11 @@ class TrainerConfig:
     """Of the hidden layers. The policy's last hidden layer is tanh in any case, as CarAware's."""
     truncation_ticks: int
     """Ticks that a gradient reaches back in a network with memory."""
+    frames: int
+    """Images in a stack that a network sees: the newest one and those of the ticks before."""
     supervised: bool
-    """Teach a network of the policy's size by regression to the truth beside it (`caraware.learn.supervised`)."""
+    """Teach a network of the policy's size by regression to the truth beside it (`caraware.learn.supervised`,
+    `caraware.learn.regression`)."""
     reward: RewardName
     reward_scale_m: float
     matmul_precision: MatmulPrecision
@@ -126,6 +132,8 @@ class TrainerConfig:
     checkpoint_keep_every: int
     """Checkpoints after a multiple of so many updates stay for good; 0: only the newest and the best."""
     estimates: EstimateTimes
+    images: ImageShape | None
+    """Those in the observations; None where they hold none."""
 
     @classmethod
     def from_run(cls, run: RunFile) -> "TrainerConfig":
@@ -134,6 +142,7 @@ class TrainerConfig:
         # These say which trainer there is, and what it may read.
         for key in ("module", "road_users"):
             section.pop(key, None)
+        section["images"] = ImageShape.from_run(run)
         keys = {_key(f.name) for f in fields(cls)}
         if wrong := sorted(keys ^ set(section)):
             what = "lacks the key" if wrong[0] in keys else "has the unknown key"
@@ -167,6 +176,8 @@ def _typed(name: str, kind: Any, section: ConfigTable) -> Any:
         return tuple(typed(key, each, int) for each in value)
     if kind == float | None:
         return None if value is None else typed(key, value, float)
+    if kind == ImageShape | None:
+        return value
     return typed(key, value, kind)
 
 
@@ -176,5 +187,5 @@ def _network(key: str, value: object) -> BuiltInNetwork | PythonClass:
     if colon and module and name:
         return PythonClass(module, name)
     if text not in list(BuiltInNetwork):
-        raise ConfigError(f"`{key}` is {text!r}", "give one of: mlp, gru, package.module:Class")
+        raise ConfigError(f"`{key}` is {text!r}", "give one of: mlp, gru, cnn, package.module:Class")
     return BuiltInNetwork(text)

@@ -8,10 +8,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
+
+if TYPE_CHECKING:
+    from caraware.learn.frames import Seen
 
 MEAN_HEAD_SCALE = 0.1
 """Variance scaling of the last policy layer (CarAware): predictions start near the middle of the map."""
@@ -82,8 +86,8 @@ class GaussianPolicy(nn.Module):
         self.network = network
         self.log_std = nn.Parameter(torch.full((actions,), math.log(initial_std)))
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Mean actions `[b, a]` of observations `[b, d]`."""
+    def forward(self, observation: "Tensor | Seen") -> Tensor:
+        """Mean actions `[b, a]` of observations `[b, d]`, with stacks of images for a network that sees."""
         mean: Tensor = self.network(observation)
         return mean
 

@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +32,9 @@ from caraware.learn.prediction import Predictor, RowPredictor
 from caraware.learn.rollout import DrawnHorizon, DrawnTick, Horizon
 from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, PPO, RANDOM, LearnerShape, StoredTensors
 from caraware.tasks.contract import Sampling, Task, TaskOutcome, TaskRows, TaskStep
+
+if TYPE_CHECKING:
+    from caraware.learn.frames import Seen
 
 ACTING_ROWS = 512
 """So many observations or fewer are quicker on the CPU than the way to a GPU and back."""
@@ -215,7 +218,7 @@ class PlainUpdate:
         `advantage` are the normalised ones of these rows. The figures are KL, clip fraction, mean and largest ratio.
         """
         # How much more probable each action is now than when it was sampled.
-        mean = self._policy(batch.observation[rows])
+        mean = self._policy(self._input(batch, rows))
         mean = mean if batch.action.ndim == 2 else mean.unsqueeze(1)
         log_ratio = log_probability(batch.action[rows], mean, self._policy.log_std) - batch.log_probability[rows]
         ratio = log_ratio.exp()
@@ -227,6 +230,10 @@ class PlainUpdate:
             kl = (ratio - 1 - log_ratio).mean().item()
             outside = ((ratio - 1).abs() > now.clip_epsilon).float().mean().item()
             return loss, [kl, outside, ratio.mean().item(), ratio.max().item()]
+
+    def _input(self, batch: Batch, rows: Tensor) -> "Tensor | Seen":
+        """What the policy sees of some rows of a batch."""
+        return batch.observation[rows]
 
     def _value_step(self, batch: Batch, rows: Tensor, now: ScheduledValues) -> list[float]:
         """One step down the error of the values."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from caraware.ipc.arrays import Scalar
-from caraware.ipc.stream import EMPTY_SLOT, LearningTick
+from caraware.ipc.image import ImageShape
+from caraware.ipc.stream import EMPTY_SLOT, LearningTick, SeeingTick
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,10 @@ class Horizon:
     """f32 `[N, d]`: what followed the last tick; None where no discount asks for it."""
     drawn: DrawnHorizon | None = None
     """None where actions are drawn when the horizon is full."""
+    images: Tensor | None = None
+    """u8 `[leading + T, N, channels, height, width]`, a view: the first `leading` are room for the ticks before.
+
+    None for a learner that does not see."""
 
     def samples(self) -> int:
         """Rows that are samples."""
@@ -84,10 +89,22 @@ class Rollout:
     """
 
     def __init__(
-        self, horizon: int, observation_size: int, *, bootstrap: bool, dark_is_nan: bool = False, drawn_actions: int = 0
+        self,
+        horizon: int,
+        observation_size: int,
+        *,
+        bootstrap: bool,
+        dark_is_nan: bool = False,
+        drawn_actions: int = 0,
+        images: ImageShape | None = None,
+        leading: int = 0,
     ) -> None:
-        """`drawn_actions`: numbers of an action that is drawn tick by tick; 0 where none is. It needs `bootstrap`."""
+        """`drawn_actions`: numbers of an action that is drawn tick by tick; 0 where none is. It needs `bootstrap`.
+
+        With `images` every tick's images are kept, behind room for those of `leading` ticks before the first.
+        """
         self._actions = drawn_actions
+        self._image_shape, self._leading = images, leading
         self._horizon, self._size, self._bootstrap = horizon, observation_size, bootstrap
         self._dark_is_nan = dark_is_nan
         self._ticks = 0
@@ -115,6 +132,11 @@ class Rollout:
         if self._dark_is_nan:
             self._observation[t, :rows].nan_to_num_()
         self._truth[t, :rows] = obs.truth
+        if self._image_shape is not None:
+            assert isinstance(obs, SeeingTick)
+            frames = self._images[self._leading + t]
+            frames[: len(obs.images)] = obs.images
+            frames[len(obs.images) :] = 0
         self._set_row(self._vehicle[t], obs.vehicle, EMPTY_SLOT)
         self._set_row(self._valid[t], obs.valid, False)
         self._terminated[t] = self._truncated[t] = False
@@ -164,6 +186,7 @@ class Rollout:
             cut=torch.from_numpy(np.pad(self._cut, (0, self._slots - len(self._cut)))),
             bootstrap=self._observation[end].clone() if self._bootstrap else None,
             drawn=self._drawn(end) if self._actions else None,
+            images=self._images[: self._leading + end] if self._image_shape else None,
         )
         self._taken, self._samples = end, self._newest_samples if self._bootstrap else 0
         return horizon
@@ -185,6 +208,9 @@ class Rollout:
             return
         for array in self._arrays():
             array[: self._ticks - self._taken] = array[self._taken : self._ticks]
+        if self._image_shape is not None:
+            left = self._images[self._leading + self._taken : self._leading + self._ticks]
+            self._images[self._leading : self._leading + len(left)] = left
         self._ticks -= self._taken
         self._taken = 0
         # The horizon before has the ends of trajectories before a tick that only served as a bootstrap.
@@ -229,12 +255,17 @@ class Rollout:
         self._action = torch.zeros(ticks, drawn_slots, self._actions)
         self._log_probability = torch.zeros(ticks, drawn_slots)
         self._ended_by = np.zeros((ticks, drawn_slots), np.uint32)
+        if self._image_shape is not None:
+            self._images = torch.zeros(self._leading + ticks, slots, *self._image_shape.size, dtype=torch.uint8)
 
     def _grow(self, ticks: int, slots: int) -> None:
         """More ticks or slots. Rare: the slots in use settle early, the ticks double up to one horizon."""
         old, t = self._arrays(), self._ticks
+        images = None if self._image_shape is None else self._images
         wide = self._slots
         self._allocate(ticks, slots)
+        if images is not None:
+            self._images[: self._leading + t, :wide] = images[: self._leading + t]
         for new, array in zip(self._arrays(), old, strict=True):
             if array.ndim == 1:
                 new[:t] = array[:t]

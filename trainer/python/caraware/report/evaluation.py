@@ -68,6 +68,8 @@ class EvaluationResult:
     """Whose episodes; the first one's index if those of all are pooled."""
     metric: str = field(kw_only=True)
     """Name of the task's metric that the estimators are compared by."""
+    further: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    """Means of the task's other metrics over all samples, by keys such as `ppo_mean_wrong_lane_percent`."""
 
     def mean(self, estimator: str) -> float | None:
         """Mean of the metric, None without that estimator."""
@@ -80,7 +82,7 @@ class EvaluationResult:
             found = self.estimates.get(estimator)
             values = (found.mean, found.standard_error, found.ci95) if found else (None, None, None)
             entries |= zip(_keys(estimator, self.metric), values, strict=True)
-        return entries
+        return entries | dict(self.further)
 
     @classmethod
     def restored(cls, entries: Mapping[str, Any]) -> "EvaluationResult":
@@ -91,12 +93,16 @@ class EvaluationResult:
             mean, standard_error, ci95 = (entries.get(key) for key in _keys(name, metric))
             if mean is not None and standard_error is not None:
                 estimates[name] = Estimate(mean, standard_error, ci95)
-        return cls(**{key: entries[key] for key in _PHASE_KEYS}, estimates=estimates, metric=metric)
+        others = [other.name for other in _native.METRICS if other.name != metric]
+        keys = [mean_key(estimator, other) for other in others for estimator in ESTIMATORS]
+        further = {key: float(entries[key]) for key in keys if entries.get(key) is not None}
+        phase = {key: entries[key] for key in _PHASE_KEYS}
+        return cls(**phase, estimates=estimates, metric=metric, further=further)
 
     def headline(self) -> dict[str, float | None]:
         """Means, half their confidence intervals and the number of seeds, for the run's report."""
         entries = self.report() | {"evaluation_seeds": self.episodes}
-        return {key: entries[key] for key in no_headline(self.metric)}
+        return {key: entries[key] for key in no_headline(self.metric)} | dict(self.further)
 
     def __str__(self) -> str:
         unit = self.metric.rsplit("_", 1)[1]
@@ -106,7 +112,8 @@ class EvaluationResult:
             if name in self.estimates
         )
         over = f"{self.episodes} seeds" if self.episodes > 1 else "the vehicles of one seed"
-        return f"{compared} (95 % over {over}), {self.samples} samples"
+        further = "".join(f", {key} {value:.2f}" for key, value in self.further.items())
+        return f"{compared} (95 % over {over}), {self.samples} samples{further}"
 
 
 _PHASE_KEYS = ("env_steps", "policy_version", "episodes", "samples", "environment")
@@ -172,6 +179,7 @@ class Evaluation:
         present = {"ekf": noise, "rts": noise, "map_ekf": noise and lanes, "supervised": supervised}
         missing = [name for name, given in present.items() if not given]
         self._known = [name for name in ESTIMATORS if name not in missing]
+        self._further: dict[str, Mean] = {}
         self._finished: list[Float64Array] = []
         self._episode: int | None = None
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
@@ -194,6 +202,11 @@ class Evaluation:
             for name, errors in filtered.items():
                 self._sums[errors.vehicle, _COLUMN[name]] += errors.error_m
             self._add_smoothed(smoothed)
+
+    def add_further(self, metric: str, values: Mapping[str, FloatArray]) -> None:
+        """Add another metric's values `[v]` on the valid rows of the same tick, by estimator."""
+        for name, of_rows in values.items():
+            self._further.setdefault(mean_key(name, metric), Mean()).add(of_rows)
 
     def _add_smoothed(self, ticks: Iterable[BaselineErrors]) -> None:
         for tick in ticks:
@@ -243,6 +256,7 @@ class Evaluation:
             estimates=estimates,
             environment=environment,
             metric=self._metric,
+            further={key: mean.value() for key, mean in self._further.items()},
         )
 
 
@@ -276,4 +290,9 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
             if None in intervals
             else math.hypot(*(s * half for s, half in zip(shares, intervals, strict=True) if half is not None)),
         )
-    return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), estimates=estimates)
+    shared = [key for key in phase[0].further if all(key in result.further for result in phase)]
+    further = {
+        key: sum(part * result.further[key] for part, result in zip(shares, phase, strict=True)) for key in shared
+    }
+    episodes = sum(result.episodes for result in phase)
+    return replace(phase[0], samples=samples, episodes=episodes, estimates=estimates, further=further)

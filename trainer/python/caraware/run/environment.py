@@ -9,6 +9,7 @@ from collections import deque
 
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel, Observation
+from caraware.learn.config import BuiltInNetwork
 from caraware.learn.rollout import Rollout
 from caraware.run.config import RunConfig
 from caraware.run.estimates import Estimates
@@ -53,6 +54,7 @@ class Environment:
         """Continue from `position`, collecting `horizon` samples for every update."""
         self.progress = StreamProgress(position)
         task = self._config.task
+        sees = self._config.trainer.network is BuiltInNetwork.CNN
         drawn = task.actions.size if task.sampling is Sampling.EACH_TICK else 0
         self.rollout = Rollout(
             horizon,
@@ -60,6 +62,8 @@ class Environment:
             bootstrap=self._config.trainer.discount > 0 or drawn > 0,
             dark_is_nan=self._config.dark_is_nan,
             drawn_actions=drawn,
+            images=self._config.trainer.images if sees else None,
+            leading=self._config.trainer.frames - 1,
         )
 
     def admit(self, ticks: list[Observation]) -> None:

@@ -7,9 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware import _native
 from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.stream import Observation
 from caraware.learn.prediction import visible
+from caraware.learn.regression import Regression
 from caraware.learn.rewards import distance_m
 from caraware.learn.supervised import Supervised
 from caraware.report.evaluation import Evaluation, EvaluationResult
@@ -17,6 +19,7 @@ from caraware.run.config import RunConfig
 from caraware.run.followed import FollowedTicks
 from caraware.run.stream_position import StreamProgress
 from caraware.tasks.contract import Sampling
+from caraware.tasks.localisation import Localisation
 from caraware.tasks.metrics import reference_names
 
 log = logging.getLogger("caraware.run.loop")
@@ -39,7 +42,7 @@ class EvaluationPhase:
         obs: Observation,
         predicted_m: Tensor,
         references: Mapping[str, FloatArray],
-        supervised: Supervised | None,
+        supervised: Supervised | Regression | None,
     ) -> None:
         """Count one tick, unless a predecessor has evaluated it; `references` are the reference metrics by name."""
         if obs.tick <= progress.evaluated_tick:
@@ -52,18 +55,34 @@ class EvaluationPhase:
             self._newest_tick = obs.tick
             return
         if self._evaluation is None:
+            # The filters estimate positions, so they are compared by a position's error alone.
+            filters = isinstance(self._config.task, Localisation)
             self._evaluation = Evaluation(
                 self._headline.name,
-                self._config.sensors,
-                lanes=self._config.lanes(),
+                self._config.sensors if filters else None,
+                lanes=self._config.lanes() if filters else None,
                 supervised=supervised is not None,
             )
-        values = {"ppo": self._config.task.measure_answers(obs, predicted_m)[self._headline.name]}
-        values |= {estimator: references[name] for estimator, name in reference_names(self._headline).items()}
-        if supervised is not None:
-            values["supervised"] = self._supervised_errors_m(obs, supervised)
-        self._evaluation.add(obs, values)
+        values = {"ppo": self._config.task.measure_answers(obs, predicted_m)}
+        if isinstance(supervised, Regression):
+            answers = supervised.answers(obs, self._config.dark_is_nan)
+            values["supervised"] = self._config.task.measure_answers(obs, answers)
+        elif supervised is not None:
+            values["supervised"] = {self._headline.name: self._supervised_errors_m(obs, supervised)}
+        for metric in self._config.task.metrics:
+            if metric.reference_for is None:
+                of_metric = {name: measured[metric.name] for name, measured in values.items()}
+                of_metric |= {name: references[of] for name, of in reference_names(metric).items()}
+                self._add(metric, obs, of_metric)
         self._newest_tick = obs.tick
+
+    def _add(self, metric: _native.Metric, obs: Observation, values: Mapping[str, FloatArray]) -> None:
+        """Add the values of one metric by estimator."""
+        assert self._evaluation is not None
+        if metric.name == self._headline.name:
+            self._evaluation.add(obs, values)
+        else:
+            self._evaluation.add_further(metric.name, values)
 
     def finish(self, progress: StreamProgress, env_steps: int, updates: int) -> EvaluationResult | None:
         """Close the phase after so many samples and updates; None if none was open."""

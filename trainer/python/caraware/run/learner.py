@@ -9,8 +9,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from caraware.learn.build import build_ppo
+from caraware.learn.config import ConfigError
 from caraware.learn.ppo import Ppo
 from caraware.learn.ranks import Ranks
+from caraware.learn.regression import Regression
 from caraware.learn.stored import PARAMETERS, SUPERVISED, LearnerShape, StoredTensors
 from caraware.learn.supervised import Supervised
 from caraware.run.checkpoint import TrainingHistory, load_checkpoint, load_history
@@ -18,6 +20,7 @@ from caraware.run.config import RunConfig
 from caraware.run.continuation import Continuation
 from caraware.run.manifest import CheckpointError, Counters
 from caraware.run.stream_position import StreamPosition
+from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
 
 
@@ -26,7 +29,7 @@ class Learner:
     """Policy, value network and how far they have come: new, or continued from a checkpoint."""
 
     ppo: Ppo
-    supervised: Supervised | None
+    supervised: Supervised | Regression | None
     """The baseline by regression, taught from the same batches."""
     counters: Counters
     history: TrainingHistory
@@ -36,9 +39,16 @@ class Learner:
         """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
         trainer = config.trainer
         ppo = build_ppo(trainer, observation_size, config.task, config.environments, ranks)
-        beside = None
+        beside: Supervised | Regression | None = None
         if trainer.supervised and isinstance(config.task, Localisation):
             beside = Supervised(trainer, observation_size, config.task, ppo.device, ranks)
+        elif trainer.supervised and isinstance(config.task, LanePosition):
+            if ranks is not None and ranks.size > 1:
+                raise ConfigError(
+                    f"`trainer.supervised` with `task.kind` = {config.task.name!r} and several ranks",
+                    "set trainer.supervised = false: the regression of this task learns from one rank's samples",
+                )
+            beside = Regression(trainer, observation_size, config.task, ppo.device)
         learner = cls(ppo, beside, Counters(0, 0, 0, -1), TrainingHistory())
         if config.resume_from is not None:
             learner.load(config.resume_from)

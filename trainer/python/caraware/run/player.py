@@ -25,6 +25,7 @@ from caraware.run.followed import FollowedTicks
 from caraware.run.loop import RECEIVE_TIMEOUT_S
 from caraware.tasks.contract import Sampling
 from caraware.tasks.ends import name_of
+from caraware.tasks.localisation import Localisation
 from caraware.tasks.metrics import interval_key, mean_key, reference_names
 
 LIVE = "live.json"
@@ -94,7 +95,9 @@ class Scoreboard:
         self.tally = tally
         self._task, self.metric = config.task, config.task.metrics[0]
         self._references = reference_names(self.metric)
-        self.estimators = ("ppo", "ekf", *self._references)
+        # The filter estimates positions: it is compared where the metric is a position's error.
+        self._filters = isinstance(self._task, Localisation)
+        self.estimators = ("ppo", *(("ekf",) if self._filters else ()), *self._references)
         self._noise = config.sensors
         self._names = Names(run)
         self._ekf = Ekf(self._noise)
@@ -107,7 +110,8 @@ class Scoreboard:
         if obs.episode != self.tally.episode or self.tally.tick < 0:
             self.tally.begin_episode(obs.episode)
             self._ekf, self._of_vehicle = Ekf(self._noise), {}
-        self._ekf.step(read_samples(obs, self._noise.convention))
+        if self._filters:
+            self._ekf.step(read_samples(obs, self._noise.convention))
         values, rows = self._measured(obs, predicted_m), np.flatnonzero(obs.valid)
         self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
         self.tally.vehicles = max(self.tally.vehicles, len(rows))
@@ -132,11 +136,11 @@ class Scoreboard:
     def _measured(self, obs: Observation, predicted_m: Tensor) -> dict[str, FloatArray]:
         """The metric on the valid rows of a tick, by estimator."""
         references = self._task.measure_references([obs])
-        return {
-            "ppo": self._task.measure_answers(obs, predicted_m)[self.metric.name],
-            "ekf": self._task.measure_answers(obs, torch.from_numpy(self._ekf.position_m))[self.metric.name],
-            **{estimator: references[name][0] for estimator, name in self._references.items()},
-        }
+        answers = {"ppo": predicted_m}
+        if self._filters:
+            answers["ekf"] = torch.from_numpy(self._ekf.position_m)
+        measured = {name: self._task.measure_answers(obs, of)[self.metric.name] for name, of in answers.items()}
+        return measured | {estimator: references[name][0] for estimator, name in self._references.items()}
 
     def metrics(self) -> dict[str, float]:
         """Means over the run by the metrics' names: of the policy and of the references."""
@@ -144,7 +148,12 @@ class Scoreboard:
         return {name: mean(estimator) or math.nan for estimator, name in names.items()}
 
     def estimates_m(self, obs: Observation) -> Float32Array | None:
-        """f32 `[n, 2]`: the filter's positions at the tick added last; not-a-number where a row is not valid."""
+        """f32 `[n, 2]`: the filter's positions at the tick added last, not-a-number where a row is not valid.
+
+        None without a filter.
+        """
+        if not self._filters:
+            return None
         position_m = np.asarray(self._ekf.position_m, dtype=np.float32)
         return np.where(np.asarray(obs.valid)[:, None], position_m, np.float32(np.nan))
 

@@ -117,7 +117,7 @@ def same_steps(of: Comparison, seed: int, *, ppo: bool, episodes: int | None = N
     """Train both on the run's horizons in their order; with `ppo` False the regression alone, which needs no policy."""
     learner = of.learner(seed)
     beside, samples = learner.supervised, 0
-    assert beside is not None
+    assert isinstance(beside, Supervised)
     rate, decay = of.config.trainer.learning_rate, of.config.trainer.learning_rate_decay
     for update, horizon in enumerate(of.horizons(learner, episodes=episodes)):
         batch = learner.ppo.score(horizon) if ppo else _unscored(of.task(), horizon)

@@ -5,11 +5,13 @@ from collections.abc import Callable, Mapping
 from caraware.ipc.run_file import ConfigError, RunFile, setting
 from caraware.tasks.contract import Task
 from caraware.tasks.driving import Driving
+from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
 
 TASKS: Mapping[str, Callable[[RunFile], Task]] = {
     "localisation": Localisation.from_run,
     "driving": Driving.from_run,
+    "lane": LanePosition.from_run,
 }
 """By `task.kind`: reads the task of a run out of its run file."""
 
