@@ -27,6 +27,8 @@ pub enum NeighbourSource {
     Vam = 3,
     /// Basic safety message: the object's own.
     Bsm = 4,
+    /// No message: the road user's own sensors perceive the object.
+    Own = 5,
 }
 
 payload_layout! {

@@ -5,6 +5,7 @@
 // Positions of 0.1 microdegrees, tenths of metres, counts: values are limited to the ranges of their message before they are cast.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+pub mod capture;
 pub mod exchange;
 pub mod local_map;
 pub mod message;
@@ -12,5 +13,6 @@ pub mod parallel;
 pub mod process;
 pub mod radio;
 pub mod random;
+pub mod roadside;
 pub mod services;
 pub mod station;

@@ -380,6 +380,14 @@ impl LocalMap {
         (self.numbers, self.unused) = (numbers, 0);
     }
 
+    /// Every known object, each station's view of it by itself, by station and slot.
+    pub fn all<'a>(&'a self, heard: &'a HeardObjects) -> impl Iterator<Item = &'a KnownObject> {
+        let numbers = self.blocks.iter().flat_map(|block| &self.numbers[block.range()]);
+        numbers
+            .filter(|number| **number != NO_OBJECT)
+            .map(|number| heard.object(*number))
+    }
+
     /// Number of known objects, each station's view of an object counted.
     #[must_use]
     pub fn len(&self) -> usize {

@@ -5,15 +5,16 @@ use std::path::Path;
 use ipc_schema::{
     block::{self, BlockError},
     board::State,
-    config::{Config, ImuConvention},
+    config::{Config, ImuConvention, RoadsideConfig},
     digest::ObservationDigest,
     failure::{Failure, FailureKind},
-    header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::{RunMembership, Wait},
     neighbours::{NeighboursLayout, NeighboursSections},
     observation::{EMPTY_SLOT, ObservationLayout},
     ports::{Message, PortError},
     process::Process,
+    run::RunFile,
     sensor::SensorKind,
     services::Channel,
     world::{VehicleState, WorldLayout},
@@ -23,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use sim_core::{geodesy::Projection, scene::Scene};
 
 use crate::{
+    capture::CaptureFile,
     exchange::{ExchangeCounts, MessageExchange, SlotMeasurement},
     station::OwnMeasurement,
 };
@@ -79,10 +81,32 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     process.write_part()
 }
 
+/// Every roadside unit stands within the map.
+fn units_are_on_the_map(run: &RunFile) -> Result<(), Failure> {
+    let [x_min, y_min, x_max, y_max] = run.map.bounds_m;
+    let is_outside =
+        |unit: &&RoadsideConfig| !(x_min..=x_max).contains(&unit.x_m) || !(y_min..=y_max).contains(&unit.y_m);
+    match run.config.v2x.roadside.iter().find(is_outside) {
+        None => Ok(()),
+        Some(unit) => Err(Failure::new(
+            FailureKind::Config,
+            format!(
+                "the roadside unit \"{}\" at {} m, {} m stands beside the map",
+                unit.id, unit.x_m, unit.y_m
+            ),
+        )
+        .with_help(format!(
+            "choose `v2x.roadside.x_m` from {x_min} to {x_max}, and `v2x.roadside.y_m` from {y_min} to {y_max}"
+        ))),
+    }
+}
+
 struct V2xProcess {
     membership: RunMembership,
     exchange: MessageExchange,
     neighbours: TickPublisher,
+    /// The file of the episode, where messages are captured.
+    capture: Option<CaptureFile>,
     digest: ObservationDigest,
     load_sum: f64,
     radio_ticks: u64,
@@ -94,6 +118,7 @@ impl V2xProcess {
     fn open(mut membership: RunMembership) -> Result<Self, Failure> {
         let scenes = Scene::of_every_map(&membership.run)?;
         let maps = membership.run.every_map();
+        units_are_on_the_map(&membership.run)?;
         let projections: Result<Vec<Projection>, _> = maps.iter().map(|map| Projection::new(&map.info)).collect();
         let projections = projections.map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
         let maps = scenes.into_iter().zip(projections).collect();
@@ -107,6 +132,7 @@ impl V2xProcess {
             membership,
             exchange,
             neighbours,
+            capture: None,
             digest: state.digest,
             load_sum: state.load_sum,
             radio_ticks: state.radio_ticks,
@@ -140,6 +166,9 @@ impl V2xProcess {
         // What is sent after the last tick of an episode arrives nowhere.
         if !header.has(LAST_OF_EPISODE) {
             self.exchange.send(&header, &slots, states);
+        }
+        if self.membership.run.config.v2x.pcap {
+            self.capture(&header)?;
         }
         self.report(&header);
         Ok(Wait::Ready)
@@ -178,6 +207,24 @@ impl V2xProcess {
         self.neighbours.publish(&header, draft)
     }
 
+    /// Writes the messages of the tick into the file of the episode.
+    fn capture(&mut self, header: &MessageHeader) -> Result<(), Failure> {
+        let unwritable = |error: std::io::Error| {
+            Failure::from_error(FailureKind::Run, &error)
+                .with_help("check free space and permissions of the run directory")
+        };
+        if header.has(FIRST_OF_EPISODE) {
+            let file = CaptureFile::create(&self.membership.run.run_dir, header.episode).map_err(unwritable)?;
+            self.capture = Some(file);
+        }
+        let Some(file) = &mut self.capture else { return Ok(()) };
+        if header.has(LAST_OF_EPISODE) {
+            return file.flush().map_err(unwritable);
+        }
+        file.push(header.sim_time_ns, self.exchange.on_air())
+            .map_err(unwritable)
+    }
+
     fn store_state(&self, tick: u64) -> Result<(), Failure> {
         let state = V2xState {
             digest: self.digest.clone(),
@@ -212,7 +259,12 @@ impl V2xProcess {
         Ok(())
     }
 
-    fn write_part(&self) -> Result<(), Failure> {
+    fn write_part(&mut self) -> Result<(), Failure> {
+        // A run that is stopped leaves what it has captured of its last episode.
+        if let Some(file) = &mut self.capture {
+            let flushed = file.flush();
+            flushed.map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+        }
         #[expect(clippy::cast_precision_loss, reason = "a mean in a report")]
         let mean = (self.radio_ticks > 0).then(|| self.load_sum / self.radio_ticks as f64);
         self.membership.write_part(&V2xReport {

@@ -1,7 +1,7 @@
 //! A station: what it measures of itself, its services, its map, and how its motion becomes a message and back.
 
 use ipc_schema::{
-    config::{Config, ImuConvention},
+    config::{Config, ImuConvention, V2xListing},
     neighbours::NeighbourSource,
 };
 use sim_core::geodesy::{Geodetic, NetPosition, Projection};
@@ -12,9 +12,10 @@ use crate::{
         GeodeticPoint, StationKind,
         bsm::BsmCore,
         cam::Cam,
-        cpm::{Cpm, PerceivedObject},
+        cpm::{Cpm, CpmOrigin, PerceivedObject, SensorRegion},
         denm::{DANGEROUS_SITUATION, Denm, DenmEvent, DenmTermination, EMERGENCY_BRAKE_ENGAGED},
         generation_delta_ms, heading_from_yaw, its_time_ms,
+        roadside_cam::RoadsideCam,
         vam::{Vam, VamProfile},
         yaw_from_heading,
     },
@@ -25,6 +26,7 @@ use crate::{
         congestion::CongestionControl,
         cpm::CpmService,
         denm::{DenmContent, DenmKind, DenmService, REPETITION_NS, VALIDITY_NS},
+        relay::WarningRelay,
         turn,
         vam::VamService,
     },
@@ -156,6 +158,10 @@ pub struct Station {
     pub denm: DenmService,
     /// The warning that is repeated.
     pub warning: Option<Denm>,
+    /// What its own sensors perceived at the last tick.
+    pub perceived: Vec<KnownObject>,
+    /// Warnings of others that a roadside unit has yet to send once more.
+    pub relay: WarningRelay,
     /// Congestion control.
     pub congestion: CongestionControl,
     /// What it knows.
@@ -246,6 +252,24 @@ pub struct PerceptionSpec {
     pub position_std_m: f64,
     /// On each axis, m/s.
     pub speed_std_mps: f64,
+    /// Angle of the field of view, radians, its middle straight ahead; none = all around.
+    pub opening_rad: Option<f64>,
+}
+
+impl PerceptionSpec {
+    /// The region for a sensor information container.
+    fn region(&self, heading_rad: f64) -> SensorRegion {
+        let angle = |half: f64, opening_rad: f64| {
+            let angle = (heading_rad + half * opening_rad).to_degrees() * 10.0;
+            angle.round().rem_euclid(3600.0) as u16
+        };
+        SensorRegion {
+            range_10cm: tenths(self.range_m).min(4095.0) as u16,
+            opening: self
+                .opening_rad
+                .map(|opening| [angle(-0.5, opening), angle(0.5, opening)]),
+        }
+    }
 }
 
 /// Composes the messages of one station at one tick.
@@ -399,6 +423,61 @@ impl MessageComposer<'_> {
         })
     }
 
+    /// A roadside unit's awareness message; `None` where the projection does not reach.
+    #[must_use]
+    pub fn roadside_cam(&self) -> Option<RoadsideCam> {
+        Some(RoadsideCam {
+            station: self.station,
+            generation_delta_ms: generation_delta_ms(its_time_ms(self.now_ns)),
+            position: self.centre()?,
+        })
+    }
+
+    /// What the station's own sensors perceive, as others would know it from a message, and the point that it is measured from: with the
+    /// station's name and without a size.
+    #[must_use]
+    pub fn own_view(&self, spec: &PerceptionSpec, perceived: &[Perception]) -> Vec<KnownObject> {
+        let Self { own, now_ns, .. } = *self;
+        let own_std_m = own.accuracy_m.map_or(UNKNOWN_POSITION_M, |accuracy| {
+            (accuracy / std::f64::consts::SQRT_2) as f32
+        });
+        let reference = KnownObject {
+            station: self.station,
+            heard_from: self.station,
+            object: 0,
+            source: NeighbourSource::Own,
+            position_m: own.front_m(self.size),
+            velocity_mps: rotate([own.speed_mps, 0.0], own.heading_rad),
+            heading_rad: turn(0.0, own.heading_rad),
+            size_m: [0.0; 2],
+            measured_ms: (fix_time_ns(now_ns, own) / 1_000_000) as i64,
+            deviations: [
+                own_std_m,
+                self.deviations.speed_mps as f32,
+                self.deviations.heading_rad as f32,
+            ],
+        };
+        let objects = perceived.iter().map(|object| {
+            let motion = object.motion(own, self.size);
+            KnownObject {
+                station: 0,
+                object: u32::from(object.object) + 1,
+                position_m: motion.position_m,
+                velocity_mps: rotate(object.velocity_body_mps, own.heading_rad),
+                heading_rad: turn(0.0, motion.heading_rad),
+                size_m: object.size_m.map(|value| value as f32),
+                measured_ms: (now_ns / 1_000_000) as i64,
+                deviations: [
+                    libm::hypotf(own_std_m, spec.position_std_m as f32),
+                    spec.speed_std_mps as f32,
+                    UNKNOWN_HEADING_RAD,
+                ],
+                ..reference
+            }
+        });
+        std::iter::once(reference).chain(objects).collect()
+    }
+
     /// A collective perception message with the objects at `included`; `None` where the projection does not reach.
     #[must_use]
     pub fn cpm(
@@ -411,6 +490,14 @@ impl MessageComposer<'_> {
         let Self { own, now_ns, .. } = *self;
         let measured_ns = fix_time_ns(now_ns, own);
         let delta_ms = ((now_ns - measured_ns) / 1_000_000).min(2047) as i16;
+        let (origin, region_rad) = match self.kind {
+            // Its region is given from east on, a vehicle's from ahead.
+            StationKind::ROADSIDE_UNIT => (CpmOrigin::Roadside, own.heading_rad),
+            _ => {
+                let heading = heading_from_yaw(own.heading_rad);
+                (CpmOrigin::Vehicle { heading }, 0.0)
+            }
+        };
         let objects = included.iter().map(|place| {
             let object = &perceived[*place];
             let position = rotate(object.position_body_m, own.heading_rad);
@@ -434,8 +521,8 @@ impl MessageComposer<'_> {
             station: self.station,
             reference_time_ms: its_time_ms(measured_ns),
             position: self.front()?,
-            heading: heading_from_yaw(own.heading_rad),
-            sensor_range_10cm: has_sensor_information.then(|| tenths(spec.range_m).min(4095.0) as u16),
+            origin,
+            sensor: has_sensor_information.then(|| spec.region(region_rad)),
             perceived: perceived.len().min(255) as u8,
             objects: objects.take(255).collect(),
         })
@@ -560,12 +647,21 @@ fn stated_deviation(confidence: Option<u8>, unit: f64, unknown: f32) -> f32 {
 }
 
 /// What a receiver knows from a collective perception message, into `known`.
-pub fn objects_of_cpm(cpm: &Cpm, now_ns: u64, projection: &Projection, known: &mut Vec<KnownObject>) {
+pub fn objects_of_cpm(
+    cpm: &Cpm,
+    now_ns: u64,
+    projection: &Projection,
+    listing: V2xListing,
+    known: &mut Vec<KnownObject>,
+) {
     let Some(reference_m) = world_from(projection, &cpm.position) else {
         return;
     };
     let own_deviation_m = position_deviation_m(&cpm.position);
     let reference_ms = (now_ns / 1_000_000) as i64 - (its_time_ms(now_ns) as i64 - cpm.reference_time_ms as i64);
+    if listing == V2xListing::Separate {
+        known.push(reference_of_cpm(cpm, reference_m, reference_ms));
+    }
     known.extend(cpm.objects.iter().map(|object| {
         let position_std_m = f64::from(object.position_confidence_cm) / 100.0 / INTERVAL_95;
         KnownObject {
@@ -585,4 +681,30 @@ pub fn objects_of_cpm(cpm: &Cpm, now_ns: u64, projection: &Projection, known: &m
             ],
         }
     }));
+}
+
+/// Number of the point at a station that its objects are measured from, beyond those of the objects.
+const REFERENCE_OBJECT: u32 = 1 << 16 | 1;
+
+/// The point that a message's objects are measured from, as the station measures it: with the station's name and without a size.
+fn reference_of_cpm(cpm: &Cpm, position_m: [f64; 2], measured_ms: i64) -> KnownObject {
+    KnownObject {
+        station: cpm.station,
+        heard_from: cpm.station,
+        object: REFERENCE_OBJECT,
+        source: NeighbourSource::Cpm,
+        position_m,
+        velocity_mps: [0.0; 2],
+        heading_rad: match cpm.origin {
+            CpmOrigin::Vehicle { heading } => yaw_from_heading(heading),
+            CpmOrigin::Roadside => 0.0,
+        },
+        size_m: [0.0; 2],
+        measured_ms,
+        deviations: [
+            position_deviation_m(&cpm.position),
+            UNKNOWN_SPEED_MPS,
+            UNKNOWN_HEADING_RAD,
+        ],
+    }
 }

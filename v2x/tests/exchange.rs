@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use ipc_schema::{
-    config::{Config, V2xAwareness},
+    config::{Config, RoadsideConfig, RoadsideService, V2xAwareness, V2xListing},
     header::{FIRST_OF_EPISODE, MessageHeader},
     neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     run::MapInfo,
@@ -18,6 +18,11 @@ use sim_core::{
 };
 use v2x::{
     exchange::{MessageExchange, SlotMeasurement},
+    message::{
+        cpm::{Cpm, CpmOrigin},
+        geonetworking,
+        roadside_cam::RoadsideCam,
+    },
     station::{OwnMeasurement, station_id},
 };
 
@@ -296,6 +301,146 @@ fn emergency_braking_is_warned_of_where_it_is_configured() {
     assert!(warned.iter().zip(&blocks).all(|(a, b)| a.of(0).len() == b.of(0).len()));
 }
 
+fn roadside(id: &str, x_m: f64, y_m: f64, services: &[RoadsideService]) -> RoadsideConfig {
+    RoadsideConfig {
+        id: id.into(),
+        x_m,
+        y_m,
+        height_m: 6.0,
+        range_m: Some(60.0),
+        heading_deg: None,
+        field_of_view_deg: None,
+        services: Some(services.to_vec()),
+    }
+}
+
+/// A house between (0, 0) and (200, 0).
+fn house_between() -> Prism {
+    let outline = vec![[95.0, -20.0], [105.0, -20.0], [105.0, 20.0], [95.0, 20.0]];
+    Prism::new("house".into(), SolidClass::Building, outline, 0.0, 10.0).unwrap()
+}
+
+#[test]
+fn a_roadside_unit_makes_known_what_it_perceives_and_adds_no_row() {
+    let mut config = config();
+    config.v2x.perception_position_std_m = 0.0;
+    config.v2x.perception_speed_std_mps = 0.0;
+    config.v2x.roadside = vec![roadside(
+        "corner",
+        150.0,
+        30.0,
+        &[RoadsideService::Cam, RoadsideService::Cpm],
+    )];
+    config.v2x.pcap = true;
+    // Radios: two of three. The third is behind the house, and in the unit's sight.
+    config.v2x.share = 1.0;
+    let cars = [car(0, 150.0, 0.0, 0.0), car(1, 10.0, 0.0, 0.0)];
+    let silent = run(&config, vec![house_between()], &cars, 1).1;
+    let [cam, cpm] = [0, 1].map(|place| {
+        let unit = silent.on_air().iter().filter(|sent| {
+            let (head, _) = geonetworking::decode(&sent.packet).unwrap();
+            head.kind == 15
+        });
+        unit.map(|sent| geonetworking::decode(&sent.packet).unwrap().1.to_vec())
+            .nth(place)
+            .unwrap()
+    });
+    assert!(RoadsideCam::decode(&cam).unwrap().position.accuracy_cm == Some(1));
+    let cpm = Cpm::decode(&cpm).unwrap();
+    assert_eq!((cpm.origin, cpm.objects.len()), (CpmOrigin::Roadside, 1));
+    assert_eq!(cpm.sensor.unwrap().range_10cm, 600);
+    // The car's centre is 1.25 m before its rear axle, and the unit's place is exact.
+    assert_eq!(cpm.objects[0].position_cm, [125, -3000]);
+    let (blocks, exchange) = run(&config, vec![house_between()], &cars, 12);
+    // One CAM at 0 s and 1 s; a CPM whenever the object or the sensor information is due.
+    let counts = exchange.counts();
+    assert_eq!((counts.roadside_sent, counts.cams), (4, 6), "{counts:?}");
+    assert!(counts.roadside_received >= 2, "{counts:?}");
+    // No row is its own, and no map lists it.
+    assert!(blocks.iter().all(|block| block.radio.len() == 2));
+    let names: Vec<u32> = cars.iter().map(|car| station_id(car.id_hash)).collect();
+    for (_, ids) in blocks.iter().flat_map(|block| [block.of(0), block.of(1)].concat()) {
+        assert!(ids[0] == 0 || names.contains(&ids[0]), "{ids:?}");
+    }
+}
+
+#[test]
+fn a_roadside_unit_sees_its_field_of_view() {
+    let mut config = config();
+    config.v2x.pcap = true;
+    let seen = |heading_deg, field_of_view_deg| {
+        let mut config = config.clone();
+        config.v2x.roadside = vec![RoadsideConfig {
+            heading_deg: Some(heading_deg),
+            field_of_view_deg,
+            ..roadside("corner", 0.0, 0.0, &[RoadsideService::Cpm])
+        }];
+        let cars = [car(0, 30.0, 0.0, 0.0), car(1, 0.0, -30.0, 0.0), car(2, -80.0, 0.0, 0.0)];
+        let exchange = run(&config, Vec::new(), &cars, 1).1;
+        let mut sent = exchange.on_air().iter().filter_map(|sent| {
+            let (_, message) = geonetworking::decode(&sent.packet).ok()?;
+            Cpm::decode(message).ok()
+        });
+        let cpm = sent.next().unwrap();
+        let opening = cpm.sensor.unwrap().opening;
+        let objects: Vec<u16> = cpm.objects.iter().map(|object| object.object).collect();
+        (objects, opening)
+    };
+    assert_eq!(seen(0.0, None), (vec![0, 1], None));
+    assert_eq!(seen(0.0, Some(90.0)), (vec![0], Some([3150, 450])));
+    assert_eq!(seen(-90.0, Some(60.0)), (vec![1], Some([2400, 3000])));
+    assert_eq!(seen(90.0, Some(90.0)), (vec![], Some([450, 1350])));
+}
+
+#[test]
+fn a_warning_reaches_behind_a_house_by_a_roadside_unit_once() {
+    let mut config = config();
+    config.v2x.denm = true;
+    config.v2x.pcap = true;
+    config.v2x.roadside = vec![roadside("corner", 100.0, 60.0, &[RoadsideService::Denm])];
+    let cars = [car(0, 0.0, 0.0, 20.0), car(1, 150.0, 0.0, 0.0)];
+    let brakes = |number: u32, tick: u64| if number == 0 && tick <= 3 { -8.0 } else { 0.0 };
+    let received = |config: &Config| {
+        let (blocks, exchange) = run_with(config, vec![house_between()], &cars, 8, brakes);
+        let of_second: u32 = blocks.iter().map(|block| block.radio[1][4]).sum();
+        (of_second, exchange.counts())
+    };
+    let (heard, counts) = received(&config);
+    // Repetitions of the same warning are not sent once more.
+    assert_eq!(counts.roadside_sent, 1, "{counts:?}");
+    config.v2x.roadside.clear();
+    let (before, alone) = received(&config);
+    assert_eq!((heard, counts.denms), (before + 1, alone.denms + 1), "{counts:?}");
+}
+
+#[test]
+fn a_separate_listing_has_every_view_and_ones_own() {
+    let mut config = config();
+    config.v2x.listing = V2xListing::Separate;
+    config.v2x.perception_range_m = 60.0;
+    config.v2x.perception_position_std_m = 0.0;
+    config.v2x.perception_speed_std_mps = 0.0;
+    let cars = [car(0, 0.0, 0.0, 0.0), car(1, 40.2, 3.0, 0.0)];
+    let (blocks, _) = run(&config, Vec::new(), &cars, 2);
+    let [own, other] = [0, 1].map(|slot: usize| station_id(cars[slot].id_hash));
+    let mut found: Vec<([u32; 3], [i32; 2])> = blocks[1]
+        .of(0)
+        .iter()
+        .map(|(numbers, ids)| (*ids, [0, 1].map(|axis: usize| numbers[axis].round() as i32)))
+        .collect();
+    found.sort_unstable();
+    let mut expected = [
+        // The other's CAM, its centre; its CPM, of itself (its front) and of this car; own sensors, from the own front, and the other.
+        ([other, other, 1], [41, 3]),
+        ([other, other, 2], [44, 3]),
+        ([0, other, 2], [1, 0]),
+        ([own, own, 5], [4, 0]),
+        ([0, own, 5], [41, 3]),
+    ];
+    expected.sort_unstable();
+    assert_eq!(found, expected);
+}
+
 #[test]
 fn the_number_of_threads_changes_nothing() {
     let blocks = |threads| {
@@ -303,6 +448,10 @@ fn the_number_of_threads_changes_nothing() {
         config.v2x.threads = threads;
         config.v2x.fading = true;
         config.v2x.perception_range_m = 50.0;
+        config.v2x.roadside = vec![
+            roadside("a", 100.0, 20.0, &RoadsideService::ALL),
+            roadside("b", 200.0, 20.0, &RoadsideService::ALL),
+        ];
         let cars: Vec<VehicleState> = (0..80)
             .map(|number| {
                 car(

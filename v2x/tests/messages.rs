@@ -7,9 +7,10 @@ use v2x::message::{
     GeodeticPoint, StationKind,
     bsm::BsmCore,
     cam::{Cam, PathPoint},
-    cpm::{Cpm, PerceivedObject},
+    cpm::{Cpm, CpmOrigin, PerceivedObject, SensorRegion},
     denm::{Denm, DenmEvent, DenmTermination},
     geonetworking::{self, BtpPort, PacketHead},
+    roadside_cam::RoadsideCam,
     vam::{Vam, VamProfile},
 };
 
@@ -83,10 +84,24 @@ fn cpm(of: &Value) -> Cpm {
         station: number(&of["station"]),
         reference_time_ms: number(&of["reference_time_ms"]),
         position: position(&of["position"]),
-        heading: number(&of["heading"]),
-        sensor_range_10cm: optional(&of["sensor_range_10cm"]),
+        // A roadside unit has no orientation.
+        origin: optional(&of["heading"]).map_or(CpmOrigin::Roadside, |heading| CpmOrigin::Vehicle { heading }),
+        sensor: optional(&of["sensor_range_10cm"]).map(|range_10cm| SensorRegion {
+            range_10cm,
+            opening: of["opening"]
+                .as_array()
+                .map(|angles| [0, 1].map(|place: usize| number(&angles[place]))),
+        }),
         perceived: number(&of["perceived"]),
         objects: of["objects"].as_array().unwrap().iter().map(object).collect(),
+    }
+}
+
+fn roadside_cam(of: &Value) -> RoadsideCam {
+    RoadsideCam {
+        station: number(&of["station"]),
+        generation_delta_ms: number(&of["generation_delta_ms"]),
+        position: position(&of["position"]),
     }
 }
 
@@ -170,12 +185,24 @@ fn cams_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
 }
 
 #[test]
-fn cpms_are_bit_for_bit_those_of_asn1tools() {
+fn cpms_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
     let vectors = vectors();
-    for vector in vectors["cpm"].as_array().unwrap() {
+    let of = |kind: &str| vectors[kind].as_array().unwrap().clone();
+    for vector in of("cpm").iter().chain(&of("roadside_cpm")) {
         let (ours, theirs) = (cpm(&vector["values"]), bytes(&vector["hex"]));
         assert_eq!(ours.encode(), theirs, "{ours:?}");
         assert_eq!(Cpm::decode(&theirs).unwrap(), ours);
+    }
+}
+
+#[test]
+fn cams_of_roadside_units_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
+    for vector in vectors()["roadside_cam"].as_array().unwrap() {
+        let (ours, theirs) = (roadside_cam(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(RoadsideCam::decode(&theirs).unwrap(), ours);
+        // A vehicle's message is another one.
+        assert!(Cam::decode(&theirs).is_err());
     }
 }
 
@@ -292,6 +319,8 @@ fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() 
         ("denm", BtpPort::Denm),
         ("vam", BtpPort::Vam),
         ("bsm", BtpPort::Cam),
+        ("roadside_cam", BtpPort::Cam),
+        ("roadside_cpm", BtpPort::Cpm),
     ]
     .map(|(kind, port)| (kind, port, of(kind)));
     let frames = variable("CARAWARE_FUZZ_FRAMES", 1_000_000);
@@ -330,7 +359,10 @@ fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() 
             "cam" => Cam::decode(&message)
                 .map(|cam| assert_eq!(Cam::decode(&cam.encode()).unwrap(), cam))
                 .is_ok(),
-            "cpm" => Cpm::decode(&message)
+            "roadside_cam" => RoadsideCam::decode(&message)
+                .map(|cam| assert_eq!(RoadsideCam::decode(&cam.encode()).unwrap(), cam))
+                .is_ok(),
+            "cpm" | "roadside_cpm" => Cpm::decode(&message)
                 .map(|cpm| assert_eq!(Cpm::decode(&cpm.encode()).unwrap(), cpm))
                 .is_ok(),
             "denm" => Denm::decode(&message)

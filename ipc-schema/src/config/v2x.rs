@@ -1,6 +1,10 @@
 //! Messages between road users and roadside units. Equations and sources: docs/v2x.md.
 
+use std::{fmt, str::FromStr};
+
 use serde::{Deserialize, Serialize};
+
+use super::text::serde_as_text;
 
 /// The formulas of path loss of 3GPP TR 37.885.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -34,6 +38,109 @@ pub enum V2xAwareness {
     Bsm,
 }
 
+/// Which descriptions of objects a row of `neighbours` lists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum V2xListing {
+    /// One for each object: its own word before another's, and never the road user itself.
+    Merged,
+    /// Every station's view of every object, of the road user itself too, and what its own sensors perceive.
+    Separate,
+}
+
+/// A service of a roadside unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RoadsideService {
+    /// Cooperative awareness messages.
+    Cam,
+    /// Collective perception messages.
+    Cpm,
+    /// Warnings that it heard, sent once more.
+    Denm,
+}
+
+impl RoadsideService {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Cam, Self::Cpm, Self::Denm];
+
+    /// Name in configurations.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cam => "cam",
+            Self::Cpm => "cpm",
+            Self::Denm => "denm",
+        }
+    }
+}
+
+/// The text is no service of a roadside unit.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("\"{0}\" is no service of a roadside unit")]
+pub struct RoadsideServiceError(pub String);
+
+serde_as_text!(RoadsideService);
+
+impl FromStr for RoadsideService {
+    type Err = RoadsideServiceError;
+
+    fn from_str(text: &str) -> Result<Self, RoadsideServiceError> {
+        let mut services = Self::ALL.into_iter();
+        services
+            .find(|service| service.name() == text)
+            .ok_or_else(|| RoadsideServiceError(text.to_owned()))
+    }
+}
+
+impl fmt::Display for RoadsideService {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
+
+/// A roadside unit: a station at a fixed place.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RoadsideConfig {
+    /// Name, of which the station id follows.
+    pub id: String,
+    /// Place, world, metres.
+    pub x_m: f64,
+    /// Place, world, metres.
+    pub y_m: f64,
+    /// Height of antenna and sensors above the ground, metres.
+    pub height_m: f64,
+    /// Range in which it perceives road users, metres; none = it perceives nothing.
+    pub range_m: Option<f64>,
+    /// Middle of its field of view, counter-clockwise from east, degrees; none = 0.
+    pub heading_deg: Option<f64>,
+    /// Angle of its field of view, degrees; none = all around.
+    pub field_of_view_deg: Option<f64>,
+    /// What it sends; none = CAMs, and CPMs where it perceives.
+    pub services: Option<Vec<RoadsideService>>,
+}
+
+impl RoadsideConfig {
+    /// Range in which it perceives, metres; 0 = it perceives nothing.
+    #[must_use]
+    pub fn range_m(&self) -> f64 {
+        self.range_m.unwrap_or(0.0)
+    }
+
+    /// True if it has this service.
+    #[must_use]
+    pub fn offers(&self, service: RoadsideService) -> bool {
+        match &self.services {
+            Some(services) => services.contains(&service),
+            None => match service {
+                RoadsideService::Cam => true,
+                RoadsideService::Cpm => self.range_m() > 0.0,
+                RoadsideService::Denm => false,
+            },
+        }
+    }
+}
+
 /// Messages between road users.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -48,6 +155,12 @@ pub struct V2xConfig {
     pub vam: bool,
     /// Nearest known objects in a row of `neighbours`.
     pub neighbours: u32,
+    /// Which descriptions of objects such a row lists.
+    pub listing: V2xListing,
+    /// Stations at fixed places.
+    pub roadside: Vec<RoadsideConfig>,
+    /// Every message on air is written into files that protocol analysers open.
+    pub pcap: bool,
     /// Formulas of path loss.
     pub path_loss: V2xPathLoss,
     /// Transmit power with the gain of both antennas, dBm.

@@ -129,6 +129,19 @@ const fn other(path: &'static str, kind: ValueKind, meaning: &'static str) -> Co
     key(path, kind, "", meaning)
 }
 
+/// Keys of a roadside unit.
+#[rustfmt::skip]
+pub const ROADSIDE_UNIT_KEYS: &[ConfigKey] = &[
+    other("v2x.roadside.id", ValueKind::Text, "Name, of which the station id follows; it is the unit's alone."),
+    float("v2x.roadside.x_m", "m", -1e6, 1e6, "Place, world frame, within the map."),
+    float("v2x.roadside.y_m", "m", -1e6, 1e6, "Place, world frame, within the map."),
+    float("v2x.roadside.height_m", "m", 0.5, 100.0, "Height of antenna and sensors above the ground."),
+    optional("v2x.roadside.range_m", "m", 1.0, 500.0, "Range in which it perceives road users. Unset = it perceives nothing."),
+    optional("v2x.roadside.heading_deg", "deg", -360.0, 360.0, "Middle of its field of view, counter-clockwise from east. Unset = 0."),
+    optional("v2x.roadside.field_of_view_deg", "deg", 1.0, 360.0, "Angle of its field of view. Unset = all around."),
+    ConfigKey { optional: true, ..other("v2x.roadside.services", ValueKind::TextsOf(TextForm::RoadsideService), "What it sends: CAMs, CPMs of what it perceives, and warnings that it heard once more (\"denm\"). Unset = CAMs, and CPMs with `range_m`.") },
+];
+
 /// Keys of a stage of the curriculum.
 #[rustfmt::skip]
 pub const STAGE_KEYS: &[ConfigKey] = &[
@@ -180,7 +193,7 @@ pub const ROADSIDE_KEYS: &[ConfigKey] = &[
 ];
 
 /// Keys of entries of lists of tables.
-const ENTRY_KEYS: [&[ConfigKey]; 4] = [STAGE_KEYS, SUITE_KEYS, SUITE_SENSOR_KEYS, ROADSIDE_KEYS];
+const ENTRY_KEYS: [&[ConfigKey]; 5] = [STAGE_KEYS, SUITE_KEYS, SUITE_SENSOR_KEYS, ROADSIDE_KEYS, ROADSIDE_UNIT_KEYS];
 
 /// Path of the sensors of a suite.
 pub const SUITE_SENSORS: &str = "suite.sensor";
@@ -408,7 +421,10 @@ pub const KEYS: &[ConfigKey] = &[
     other("v2x.awareness", ValueKind::Choice(&["cam", "bsm"]), "Message by which vehicles make themselves known: ETSI's CAM, or SAE's BSM (core data) every 0.1 s."),
     other("v2x.denm", ValueKind::Flag, "Vehicles warn of their emergency braking (DENM)."),
     other("v2x.vam", ValueKind::Flag, "Pedestrians with a smartphone (`gnss.pedestrians`) are connected road users of `v2x.share`, and send VAMs."),
-    integer("v2x.neighbours", "objects", 1, 64, "Nearest known objects in a row of the block `neighbours`."),
+    integer("v2x.neighbours", "objects", 1, 256, "Nearest known objects in a row of the block `neighbours`."),
+    other("v2x.listing", ValueKind::Choice(&["merged", "separate"]), "Descriptions of objects in a row of `neighbours`: one for each object, never of the road user itself (\"merged\"); or every station's view of every object, of the road user itself too, and what its own sensors perceive (\"separate\")."),
+    other("v2x.roadside", ValueKind::Tables(ROADSIDE_UNIT_KEYS), "Roadside units, each a `[[v2x.roadside]]`: stations at fixed places, with perception of their own (docs/v2x.md); [] = none."),
+    other("v2x.pcap", ValueKind::Flag, "Write every message on air into `messages/episode-N.pcap` of the environment, which protocol analysers open."),
     other("v2x.path_loss", ValueKind::Choice(&["urban", "highway"]), "Formulas of 3GPP TR 37.885 for the path loss. Whether buildings or vehicles obstruct a link follows from the scene."),
     float("v2x.power_dbm", "dBm", -20.0, 40.0, "Transmit power, with the gain of both antennas."),
     float("v2x.noise_figure_db", "dB", 0.0, 30.0, "Noise figure of a receiver."),

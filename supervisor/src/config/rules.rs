@@ -6,6 +6,7 @@ use ipc_schema::{
 };
 
 mod curriculum;
+mod roadside;
 mod sensors;
 mod suites;
 
@@ -42,6 +43,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     }
     task(settings, config)?;
     curriculum::check(settings, config)?;
+    roadside::check(settings, config)?;
     if let Some((path, message, help)) = unattachable(config) {
         return Err(conflict(settings, path, message, help.into()));
     }

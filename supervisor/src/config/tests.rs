@@ -828,3 +828,42 @@ fn faults_of_suites_are_named_with_their_lines() {
     }
     assert!(error_of("[suite]\nname = \"a\"\n").0.contains("`suite` cannot be"));
 }
+
+#[test]
+fn roadside_units_have_names_of_their_own_and_receivers() {
+    let unit = |more: &str| format!("[[v2x.roadside]]\nid = \"a\"\nx_m = 1\ny_m = 2\nheight_m = 6\n{more}");
+    let with_radios = |more: &str| format!("[v2x]\nshare = 0.5\n{}", unit(more));
+    let config = config_of(&with_radios("range_m = 80\nservices = [\"cpm\", \"denm\"]\n")).unwrap();
+    let units = config.v2x.roadside;
+    assert_eq!(
+        (units.len(), units[0].range_m, units[0].heading_deg),
+        (1, Some(80.0), None)
+    );
+    let (message, help) = error_of(&unit(""));
+    assert!(
+        message.contains("my.toml:1: `v2x.roadside` has 1 units, but no road user has a radio"),
+        "{message}"
+    );
+    assert!(help.contains("v2x.share"), "{help}");
+    let (message, _) = error_of(&with_radios(&unit("")));
+    assert!(
+        message.contains("my.toml:9: unit 2 of `v2x.roadside` has the id \"a\""),
+        "{message}"
+    );
+    let (message, help) = error_of(&with_radios("services = [\"cpm\"]\n"));
+    assert!(
+        message.contains("my.toml:8: unit 1 of `v2x.roadside`, \"a\", sends CPMs"),
+        "{message}"
+    );
+    assert!(help.contains("range_m"), "{help}");
+    let (message, help) = error_of(&with_radios("services = [\"bsm\"]\n"));
+    assert!(message.contains("my.toml:8"), "{message}");
+    assert!(help.contains("\"cam\", \"cpm\", \"denm\""), "{help}");
+    let (message, _) = error_of(&with_radios("heigth = 3\n"));
+    assert!(message.contains("unknown key `v2x.roadside.heigth`"), "{message}");
+    let (message, _) = error_of("[v2x]\nshare = 1.0\n[[v2x.roadside]]\nid = \"a\"\nx_m = 1\ny_m = 2\n");
+    assert!(
+        message.contains("entry 1 of `v2x.roadside` has no `height_m`"),
+        "{message}"
+    );
+}

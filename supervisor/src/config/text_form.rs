@@ -3,7 +3,7 @@
 use std::{fmt::Display, str::FromStr};
 
 use ipc_schema::{
-    config::{ClassModel, CurriculumMap, FanoutEndpoint, MeshPlacement, Network, RegionCorner},
+    config::{ClassModel, CurriculumMap, FanoutEndpoint, MeshPlacement, Network, RegionCorner, RoadsideService},
     props::{Obstacle, PROPS, PropName},
     traffic::VEHICLE_CLASSES,
 };
@@ -33,6 +33,8 @@ pub enum TextForm {
     Suite,
     /// One of [`VEHICLE_CLASSES`].
     VehicleClass,
+    /// A [`RoadsideService`].
+    RoadsideService,
 }
 
 impl TextForm {
@@ -53,6 +55,7 @@ impl TextForm {
             Self::Suite => suites::ready_made(text).map(drop),
             Self::VehicleClass if VEHICLE_CLASSES.contains(&text) => Ok(()),
             Self::VehicleClass => Err(format!("\"{text}\" is no vehicle class of SUMO")),
+            Self::RoadsideService => read::<RoadsideService>(text),
         }
     }
 
@@ -76,6 +79,7 @@ impl TextForm {
             Self::Prop => format!("props: {}", prop_names()),
             Self::Suite => format!("\"NAME\", \"NAME:SLOTS\" with a name of {}", suites::names()),
             Self::VehicleClass => VEHICLE_CLASSES.join(", "),
+            Self::RoadsideService => format!("\"{}\"", RoadsideService::ALL.map(RoadsideService::name).join("\", \"")),
         }
     }
 }

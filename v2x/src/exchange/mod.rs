@@ -5,7 +5,7 @@
 use std::{ops::Range, sync::Arc};
 
 use ipc_schema::{
-    config::{Config, V2xConfig},
+    config::{Config, RoadsideService, V2xConfig, V2xListing},
     header::{FIRST_OF_EPISODE, MessageHeader},
     neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     observation::EMPTY_SLOT,
@@ -21,6 +21,7 @@ use crate::{
         bsm::BsmCore,
         cam::Cam,
         cpm::Cpm,
+        denm::Denm,
         geonetworking::{self, BtpPort},
         vam::Vam,
         wsmp,
@@ -34,9 +35,10 @@ use crate::{
         obstruction::{Antenna, Obstacles},
     },
     random::{LinkKey, RadioDraw, RadioRandom},
+    roadside::RoadsideUnit,
     services::{
         bsm::BsmService, cam::CamService, congestion::CongestionControl, cpm::CpmService, denm::DenmService,
-        vam::VamService,
+        relay::WarningRelay, vam::VamService,
     },
     station::{
         OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize, object_of_bsm, object_of_cam,
@@ -85,6 +87,10 @@ pub struct ExchangeCounts {
     pub links: u64,
     /// Receptions, one for each message and receiver.
     pub received: u64,
+    /// Messages that roadside units sent; they are among the others too.
+    pub roadside_sent: u64,
+    /// Receptions by roadside units; they are among the others too.
+    pub roadside_received: u64,
 }
 
 /// A message as its receivers read it.
@@ -94,6 +100,17 @@ struct HeardMessage {
     sender: usize,
     /// Numbers of its objects among all that was heard.
     objects: Range<u32>,
+}
+
+/// A message that was on air.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AirPacket {
+    /// Beginning, nanoseconds since the beginning of the tick.
+    pub start_ns: u64,
+    /// Station that sent it.
+    pub station: u32,
+    /// Its bytes, from the header of the network on.
+    pub packet: Vec<u8>,
 }
 
 /// What a slot's radio did in the tick before.
@@ -109,6 +126,7 @@ struct RadioActivity {
 struct ExchangeMap {
     obstacles: Obstacles,
     projection: Projection,
+    roadside: Vec<RoadsideUnit>,
 }
 
 /// The messages of a run.
@@ -123,7 +141,9 @@ pub struct MessageExchange {
     at: usize,
     random: RadioRandom,
     links: LinkComputer,
-    /// By slot.
+    /// Slots of the tick.
+    slots: usize,
+    /// By slot, then by roadside unit; so are `activity`, `inbox` and `rows`.
     stations: Vec<Option<Station>>,
     activity: Vec<RadioActivity>,
     /// Objects of the messages that maps may refer to.
@@ -134,6 +154,8 @@ pub struct MessageExchange {
     inbox: Vec<Vec<u32>>,
     /// Row in the world of each slot's vehicle.
     rows: Vec<Option<u32>>,
+    /// Messages of the last tick, where they are captured.
+    air: Vec<AirPacket>,
     counts: ExchangeCounts,
 }
 
@@ -154,12 +176,18 @@ impl MessageExchange {
                 range_m: v2x.perception_range_m,
                 position_std_m: v2x.perception_position_std_m,
                 speed_std_mps: v2x.perception_speed_std_mps,
+                opening_rad: None,
             },
             maps: maps
                 .into_iter()
                 .map(|(scene, projection)| ExchangeMap {
                     obstacles: Obstacles::new(&scene),
                     projection,
+                    roadside: v2x
+                        .roadside
+                        .iter()
+                        .map(|unit| RoadsideUnit::new(unit, &v2x, &scene))
+                        .collect(),
                 })
                 .collect(),
             at: 0,
@@ -167,12 +195,14 @@ impl MessageExchange {
             medium,
             decoding: DecodingTable::default(),
             random,
-            stations: Vec::new(),
-            activity: Vec::new(),
+            slots: 0,
+            stations: vec![None; v2x.roadside.len()],
+            activity: vec![RadioActivity::default(); v2x.roadside.len()],
             objects: HeardObjects::default(),
             heard: Vec::new(),
-            inbox: Vec::new(),
+            inbox: vec![Vec::new(); v2x.roadside.len()],
             rows: Vec::new(),
+            air: Vec::new(),
             counts: ExchangeCounts::default(),
             config: v2x,
         }
@@ -187,6 +217,12 @@ impl MessageExchange {
     /// Continues counting.
     pub fn set_counts(&mut self, counts: ExchangeCounts) {
         self.counts = counts;
+    }
+
+    /// Messages of the last [`MessageExchange::send`] by their beginning, where the configuration asks for them (`v2x.pcap`).
+    #[must_use]
+    pub fn on_air(&self) -> &[AirPacket] {
+        &self.air
     }
 
     /// Slots of the senders of the messages of the last [`MessageExchange::send`], by the beginning of the message.
@@ -250,11 +286,21 @@ impl MessageExchange {
 
     /// Gives each slot its station; one whose vehicle is new begins with an empty map.
     fn take_slots(&mut self, slots: &[SlotMeasurement], states: &[VehicleState]) {
-        self.stations.resize(slots.len(), None);
-        self.activity.resize(slots.len(), RadioActivity::default());
-        self.inbox.resize(slots.len(), Vec::new());
+        let before = std::mem::replace(&mut self.slots, slots.len());
+        set_slots(&mut self.stations, before, slots.len());
+        set_slots(&mut self.activity, before, slots.len());
+        set_slots(&mut self.inbox, before, slots.len());
         self.rows.clear();
-        self.rows.resize(slots.len(), None);
+        self.rows.resize(self.stations.len(), None);
+        for (place, unit) in (slots.len()..).zip(&self.maps[self.at].roadside) {
+            if self.stations[place].is_none() {
+                let station = Station {
+                    is_equipped: true,
+                    ..self.begin_station(unit.id_hash, false)
+                };
+                self.stations[place] = Some(station);
+            }
+        }
         // Dense indices of vehicles → rows.
         let most = states
             .iter()
@@ -308,6 +354,8 @@ impl MessageExchange {
             vam: VamService::default(),
             denm: DenmService::default(),
             warning: None,
+            perceived: Vec::new(),
+            relay: WarningRelay::default(),
             congestion: CongestionControl::new(self.config.congestion_control),
             map: LocalMap::default(),
         }
@@ -328,6 +376,7 @@ impl MessageExchange {
             .map(|((objects, ids), radio)| WrittenRow { objects, ids, radio })
             .collect();
         let (stations, activity, at_row, heard) = (&self.stations, &self.activity, &self.rows, &self.objects);
+        let listing = self.config.listing;
         parallel::for_each(self.config.threads as usize, &mut rows, |slot, row| {
             let Some(station) = &stations[slot] else { return };
             let done = activity[slot];
@@ -343,7 +392,13 @@ impl MessageExchange {
             };
             let size = size_of(&states[world as usize]);
             let mut nearest = Vec::new();
-            station.map.nearest(heard, own.centre_m(&size), count, &mut nearest);
+            match listing {
+                V2xListing::Merged => station.map.nearest(heard, own.centre_m(&size), count, &mut nearest),
+                V2xListing::Separate => {
+                    let views = station.map.all(heard).chain(&station.perceived);
+                    nearest_views(views, own.centre_m(&size), now_ms, count, &mut nearest);
+                }
+            }
             for (place, object) in nearest.iter().enumerate() {
                 (row.objects[place], row.ids[place]) = object.columns(now_ms);
             }
@@ -358,7 +413,11 @@ impl MessageExchange {
     pub fn send(&mut self, header: &MessageHeader, slots: &[SlotMeasurement], states: &[VehicleState]) {
         self.maps[self.at].obstacles.update(states);
         let radios = self.radios(states);
-        let ExchangeMap { obstacles, projection } = &self.maps[self.at];
+        let ExchangeMap {
+            obstacles,
+            projection,
+            roadside,
+        } = &self.maps[self.at];
         let tick = StationTick {
             now_ns: header.sim_time_ns,
             tick: (header.sim_time_ns / self.medium.tick_ns) as u32,
@@ -369,6 +428,7 @@ impl MessageExchange {
             random: &self.random,
             deviations: &self.deviations,
             perception: &self.perception,
+            roadside,
             config: &self.config,
         };
         let outgoing = outgoing(&tick, &radios, &mut self.stations, self.config.threads as usize);
@@ -384,10 +444,44 @@ impl MessageExchange {
         self.counts.links += links.iter().map(|links| links.len() as u64).sum::<u64>();
         let schedule = self.medium.schedule(&queue, &links, &self.random);
         self.deliver(header, &outgoing, &queue, &links, &schedule, &radios);
+        self.relay_warnings(&outgoing, &schedule);
+        if self.config.pcap {
+            self.capture(outgoing, &schedule);
+        }
         let loads = self.medium.channel_load(&schedule, &queue, &links, radios.len());
         for (radio, load) in radios.iter().zip(loads) {
             self.activity[radio.slot].load = load;
         }
+    }
+
+    /// Gives each roadside unit that sends warnings once more those that it heard.
+    fn relay_warnings(&mut self, outgoing: &[OutgoingMessage], schedule: &Schedule) {
+        let units = &self.maps[self.at].roadside;
+        for (place, unit) in (self.slots..).zip(units) {
+            let (Some(station), true) = (&mut self.stations[place], unit.config.offers(RoadsideService::Denm)) else {
+                continue;
+            };
+            for number in &self.inbox[place] {
+                let sent = &outgoing[schedule.on_air[*number as usize].queued];
+                if SendingService::of(sent.queued.message) != SendingService::Denm {
+                    continue;
+                }
+                let message = geonetworking::decode(&sent.packet).map(|(_, message)| message);
+                if let Ok((warning, bytes)) = message.and_then(|bytes| Ok((Denm::decode(bytes)?, bytes))) {
+                    station.relay.hear(&warning, bytes);
+                }
+            }
+        }
+    }
+
+    /// Keeps what was on air.
+    fn capture(&mut self, mut outgoing: Vec<OutgoingMessage>, schedule: &Schedule) {
+        let sent = schedule.on_air.iter().map(|sent| AirPacket {
+            start_ns: sent.start_ns,
+            station: outgoing[sent.queued].queued.station,
+            packet: std::mem::take(&mut outgoing[sent.queued].packet),
+        });
+        self.air = sent.collect();
     }
 
     /// Radios of the equipped stations, by slot.
@@ -407,7 +501,17 @@ impl MessageExchange {
                 },
             })
         };
-        self.stations.iter().enumerate().filter_map(radio).collect()
+        let unit = |(place, unit): (usize, &RoadsideUnit)| {
+            let station = self.stations[place].as_ref()?;
+            Some(Radio {
+                slot: place,
+                station: station.station,
+                antenna: unit.antenna,
+            })
+        };
+        let slots = self.stations[..self.slots].iter().enumerate().filter_map(radio);
+        let units = (self.slots..).zip(&self.maps[self.at].roadside).filter_map(unit);
+        slots.chain(units).collect()
     }
 
     /// Puts what is decoded into the receivers' inboxes.
@@ -430,10 +534,11 @@ impl MessageExchange {
         let decoded =
             Receptions::new(&self.medium, &self.decoding, on_air, &self.random).decoded(self.config.threads as usize);
         let (threads, projection) = (self.config.threads as usize, &self.maps[self.at].projection);
+        let listing = self.config.listing;
         let mut contents: Vec<Vec<KnownObject>> = vec![Vec::new(); schedule.on_air.len()];
         parallel::for_each(threads, &mut contents, |number, objects| {
             let packet = &outgoing[schedule.on_air[number].queued].packet;
-            read_packet(packet, header.sim_time_ns, projection, objects);
+            read_packet(packet, header.sim_time_ns, projection, listing, objects);
         });
         self.heard.clear();
         for (sent, contents) in schedule.on_air.iter().zip(contents) {
@@ -444,7 +549,9 @@ impl MessageExchange {
         }
         for sent in &schedule.on_air {
             let message = &queue[sent.queued];
-            let sender = &mut self.activity[radios[message.radio as usize].slot];
+            let slot = radios[message.radio as usize].slot;
+            self.counts.roadside_sent += u64::from(slot >= self.slots);
+            let sender = &mut self.activity[slot];
             sender.sent += 1;
             sender.bytes += message.bytes;
             match SendingService::of(message.message) {
@@ -460,10 +567,40 @@ impl MessageExchange {
         for (radio, decoded) in radios.iter().zip(decoded) {
             self.activity[radio.slot].received += decoded.len() as u32;
             self.counts.received += decoded.len() as u64;
+            if radio.slot >= self.slots {
+                self.counts.roadside_received += decoded.len() as u64;
+            }
             self.inbox[radio.slot] = decoded;
         }
         self.counts.dropped += u64::from(schedule.dropped);
     }
+}
+
+/// Gives `items` as many places for slots as there are now, with those of roadside units behind them.
+fn set_slots<T: Clone + Default>(items: &mut Vec<T>, before: usize, now: usize) {
+    if now > before {
+        items.splice(before..before, vec![T::default(); now - before]);
+    } else {
+        items.drain(now..before);
+    }
+}
+
+/// The `count` views nearest to `from_m` at `now_ms`, into `nearest`; at the same distance in the order in which they came.
+fn nearest_views<'a>(
+    views: impl Iterator<Item = &'a KnownObject>,
+    from_m: [f64; 2],
+    now_ms: i64,
+    count: usize,
+    nearest: &mut Vec<&'a KnownObject>,
+) {
+    let distance2 = |view: &KnownObject| {
+        let [x, y] = view.position_at_m(now_ms);
+        (x - from_m[0]).powi(2) + (y - from_m[1]).powi(2)
+    };
+    let mut all: Vec<(f64, &KnownObject)> = views.map(|view| (distance2(view), view)).collect();
+    all.sort_by(|a, b| a.0.total_cmp(&b.0));
+    nearest.clear();
+    nearest.extend(all.into_iter().take(count).map(|(_, view)| view));
 }
 
 fn size_of(state: &VehicleState) -> VehicleSize {
@@ -480,7 +617,7 @@ fn size_of(state: &VehicleState) -> VehicleSize {
 }
 
 /// Reads a packet as a receiver does, from its bytes.
-fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut Vec<KnownObject>) {
+fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, listing: V2xListing, known: &mut Vec<KnownObject>) {
     if let Ok(message) = wsmp::decode(packet) {
         let bsm = BsmCore::decode(message);
         known.extend(bsm.ok().and_then(|bsm| object_of_bsm(&bsm, now_ns, projection)));
@@ -490,13 +627,14 @@ fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut 
         return;
     };
     match head.port {
+        // That of a roadside unit is of no road user.
         BtpPort::Cam => {
             let cam = Cam::decode(message);
             known.extend(cam.ok().and_then(|cam| object_of_cam(&cam, now_ns, projection)));
         }
         BtpPort::Cpm => {
             if let Ok(cpm) = Cpm::decode(message) {
-                objects_of_cpm(&cpm, now_ns, projection, known);
+                objects_of_cpm(&cpm, now_ns, projection, listing, known);
             }
         }
         BtpPort::Vam => {

@@ -1,7 +1,7 @@
 //! What the services of a station send at a tick.
 
 use ipc_schema::{
-    config::{V2xAwareness, V2xConfig},
+    config::{RoadsideService, V2xAwareness, V2xConfig, V2xListing},
     world::VehicleState,
 };
 use sim_core::geodesy::Projection;
@@ -21,12 +21,13 @@ use crate::{
         reception::{FRAME_BYTES, air_time_s},
     },
     random::RadioRandom,
+    roadside::RoadsideUnit,
     services::{
         MeasuredMotion,
         congestion::CongestionControl,
         cpm::{ObjectKind, PerceivedMotion},
     },
-    station::{MessageComposer, OwnMeasurement, PerceptionSpec, SensorDeviations, Station},
+    station::{MessageComposer, OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize},
 };
 
 /// Length from which a vehicle calls itself a lorry, metres.
@@ -122,8 +123,10 @@ pub struct StationTick<'a> {
     pub random: &'a RadioRandom,
     /// What sensors deviate by.
     pub deviations: &'a SensorDeviations,
-    /// What stations perceive.
+    /// What vehicles perceive.
     pub perception: &'a PerceptionSpec,
+    /// Roadside units: their places among the stations follow those of the slots.
+    pub roadside: &'a [RoadsideUnit],
     /// Which messages are sent.
     pub config: &'a V2xConfig,
 }
@@ -161,6 +164,51 @@ pub fn outgoing(
 
 impl StationTurn<'_> {
     fn generate(&mut self, tick: &StationTick) {
+        match self.radio.slot.checked_sub(tick.slots.len()) {
+            None => self.generate_of_road_user(tick),
+            Some(unit) => self.generate_of_roadside(tick, &tick.roadside[unit]),
+        }
+    }
+
+    fn generate_of_roadside(&mut self, tick: &StationTick, unit: &RoadsideUnit) {
+        let composer = MessageComposer {
+            station: self.station.station,
+            kind: StationKind::ROADSIDE_UNIT,
+            now_ns: tick.now_ns,
+            own: &unit.own,
+            size: &VehicleSize::default(),
+            deviations: tick.deviations,
+            projection: tick.projection,
+        };
+        let Some(position) = composer.roadside_cam().map(|cam| cam.position) else {
+            return;
+        };
+        if let Some(warning) = self.station.relay.next_waiting() {
+            self.send(tick, &composer, SendingService::Denm, &warning, &position);
+        }
+        if unit.config.offers(RoadsideService::Cam) {
+            self.generate_roadside_cam(tick, &composer);
+        }
+        if unit.config.offers(RoadsideService::Cpm) {
+            let observer = Observer::of_roadside(unit, self.station.station, tick);
+            self.generate_cpm(tick, &composer, &observer, &unit.perception);
+        }
+    }
+
+    /// What stands still has no news: its messages come once a second (EN 302 637-2, section 6.1.4).
+    fn generate_roadside_cam(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let gap_ns = self.gap_ns(SendingService::Cam);
+        let motion = composer.own.motion(composer.size);
+        if self.station.cam.check(tick.now_ns, &motion, gap_ns).is_none() {
+            return;
+        }
+        if let Some(cam) = composer.roadside_cam() {
+            self.send(tick, composer, SendingService::Cam, &cam.encode(), &cam.position);
+        }
+    }
+
+    fn generate_of_road_user(&mut self, tick: &StationTick) {
+        self.station.perceived.clear();
         let Some(own) = &tick.slots[self.radio.slot].own else {
             return;
         };
@@ -190,7 +238,8 @@ impl StationTurn<'_> {
             V2xAwareness::Bsm => self.generate_bsm(tick, &composer),
         }
         if tick.perception.range_m > 0.0 {
-            self.generate_cpm(tick, &composer);
+            let observer = Observer::of_vehicle(&self.radio.antenna, self.station.station, tick);
+            self.generate_cpm(tick, &composer, &observer, tick.perception);
         }
     }
 
@@ -242,16 +291,17 @@ impl StationTurn<'_> {
         }
     }
 
-    fn generate_cpm(&mut self, tick: &StationTick, composer: &MessageComposer) {
-        let observer = Observer {
-            antenna: &self.radio.antenna,
-            station: self.station.station,
-            tick: tick.tick,
-            states: tick.states,
-            obstacles: tick.obstacles,
-            random: tick.random,
-        };
-        let perceived = observer.perceive(tick.perception);
+    fn generate_cpm(
+        &mut self,
+        tick: &StationTick,
+        composer: &MessageComposer,
+        observer: &Observer,
+        spec: &PerceptionSpec,
+    ) {
+        let perceived = observer.perceive(spec);
+        if tick.config.listing == V2xListing::Separate {
+            self.station.perceived = composer.own_view(spec, &perceived);
+        }
         let motions: Vec<PerceivedMotion> = perceived
             .iter()
             .map(|object| PerceivedMotion {
@@ -268,7 +318,7 @@ impl StationTurn<'_> {
             return;
         };
         let has_sensors = content.has_sensor_information;
-        if let Some(cpm) = composer.cpm(tick.perception, &perceived, &content.objects, has_sensors) {
+        if let Some(cpm) = composer.cpm(spec, &perceived, &content.objects, has_sensors) {
             self.send(tick, composer, SendingService::Cpm, &cpm.encode(), &cpm.position);
         }
     }

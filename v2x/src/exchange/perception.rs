@@ -1,18 +1,27 @@
 //! What a station perceives with its own sensors.
 
 use ipc_schema::{traffic::Kind, world::VehicleState};
-use sim_core::scene::shape::Bounds;
+use sim_core::scene::shape::{Bounds, Point};
 
+use super::outgoing::StationTick;
 use crate::{
     radio::obstruction::{Antenna, Obstacles},
     random::{LinkKey, RadioDraw, RadioRandom},
+    roadside::RoadsideUnit,
+    services::turn,
     station::{Perception, PerceptionSpec, rotate, station_id},
 };
 
-/// A vehicle that perceives others at a tick.
+/// A station that perceives road users at a tick.
 pub struct Observer<'a> {
     /// Its antenna.
     pub antenna: &'a Antenna,
+    /// Its middle, from which the range counts, metres.
+    pub centre_m: Point,
+    /// The point that objects are measured from, metres.
+    pub origin_m: Point,
+    /// Where it points, radians counter-clockwise from east.
+    pub yaw_rad: f64,
     /// Id of its station.
     pub station: u32,
     /// The tick.
@@ -25,20 +34,56 @@ pub struct Observer<'a> {
     pub random: &'a RadioRandom,
 }
 
-impl Observer<'_> {
-    /// Objects that the vehicle sees: in range, and neither a building nor another road user in the way of their centre.
+impl<'a> Observer<'a> {
+    /// A vehicle of the tick, by the antenna that it carries.
+    #[must_use]
+    pub fn of_vehicle(antenna: &'a Antenna, station: u32, tick: &StationTick<'a>) -> Self {
+        let body = &tick.obstacles.bodies()[antenna.row as usize];
+        Self {
+            antenna,
+            centre_m: body.centre_m,
+            origin_m: body.world_from_local([body.half_m[0], 0.0]),
+            yaw_rad: tick.states[antenna.row as usize].yaw_rad,
+            station,
+            tick: tick.tick,
+            states: tick.states,
+            obstacles: tick.obstacles,
+            random: tick.random,
+        }
+    }
+
+    /// A roadside unit of the tick.
+    #[must_use]
+    pub fn of_roadside(unit: &'a RoadsideUnit, station: u32, tick: &StationTick<'a>) -> Self {
+        Self {
+            antenna: &unit.antenna,
+            centre_m: unit.antenna.position_m,
+            origin_m: unit.antenna.position_m,
+            yaw_rad: unit.own.heading_rad,
+            station,
+            tick: tick.tick,
+            states: tick.states,
+            obstacles: tick.obstacles,
+            random: tick.random,
+        }
+    }
+
+    /// Objects that the station sees: in range and in its field of view, and neither a building nor another road user in the way of their
+    /// centre.
     #[must_use]
     pub fn perceive(&self, spec: &PerceptionSpec) -> Vec<Perception> {
         let Self { states, obstacles, .. } = self;
-        let (bodies, state) = (obstacles.bodies(), &states[self.antenna.row as usize]);
-        let own = &bodies[self.antenna.row as usize];
-        let front_m = own.world_from_local([own.half_m[0], 0.0]);
+        let (bodies, yaw_rad) = (obstacles.bodies(), self.yaw_rad);
         let mut near = Vec::new();
-        obstacles.road_users_near(&Bounds::about(own.centre_m, spec.range_m), &mut near);
+        obstacles.road_users_near(&Bounds::about(self.centre_m, spec.range_m), &mut near);
         let object = |row: &u32| {
             let (body, other) = (&bodies[*row as usize], &states[*row as usize]);
-            let [dx, dy] = [0, 1].map(|axis: usize| body.centre_m[axis] - own.centre_m[axis]);
+            let [dx, dy] = [0, 1].map(|axis: usize| body.centre_m[axis] - self.centre_m[axis]);
             if *row == self.antenna.row || dx * dx + dy * dy > spec.range_m * spec.range_m {
+                return None;
+            }
+            let is_outside = |opening_rad: f64| turn(yaw_rad, libm::atan2(dy, dx)).abs() > 0.5 * opening_rad;
+            if spec.opening_rad.is_some_and(is_outside) {
                 return None;
             }
             let target = Antenna {
@@ -57,14 +102,14 @@ impl Observer<'_> {
                 message: self.tick,
             };
             let [ex, ey, ev, ew] = self.random.normals(key, RadioDraw::Perception, 0).map(f64::from);
-            let offset = [body.centre_m[0] - front_m[0], body.centre_m[1] - front_m[1]];
-            let [ahead, left] = rotate(offset, -state.yaw_rad);
+            let offset = [body.centre_m[0] - self.origin_m[0], body.centre_m[1] - self.origin_m[1]];
+            let [ahead, left] = rotate(offset, -yaw_rad);
             let velocity = rotate(
                 [
                     f64::from(other.velocity_body_mps[0]),
                     f64::from(other.velocity_body_mps[1]),
                 ],
-                other.yaw_rad - state.yaw_rad,
+                other.yaw_rad - yaw_rad,
             );
             Some(Perception {
                 object: (other.vehicle % 65_535) as u16,
@@ -73,7 +118,7 @@ impl Observer<'_> {
                     velocity[0] + spec.speed_std_mps * ev,
                     velocity[1] + spec.speed_std_mps * ew,
                 ],
-                turn_rad: other.yaw_rad - state.yaw_rad,
+                turn_rad: other.yaw_rad - yaw_rad,
                 size_m: [other.length_m.into(), other.width_m.into()],
                 is_person: other.kind == Kind::Person as u32,
             })

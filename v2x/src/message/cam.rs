@@ -6,8 +6,10 @@ use super::{
     uper::{BitReader, BitWriter},
 };
 
-const MESSAGE_ID: i64 = 2;
-const DELTA_TIME: [i64; 2] = [0, 65_535];
+/// `messageID` of a cooperative awareness message.
+pub(super) const MESSAGE_ID: i64 = 2;
+/// Range of `GenerationDeltaTime`.
+pub(super) const DELTA_TIME: [i64; 2] = [0, 65_535];
 const DIRECTION: [i64; 2] = [0, 2];
 const LENGTH: [i64; 2] = [1, 1023];
 const TRAILER: [i64; 2] = [0, 4];

@@ -1,4 +1,4 @@
-//! Collective perception message: ETSI TS 103 324 V2.1.1 (`CPM-PDU-Descriptions`, version 1.1.1), of a vehicle.
+//! Collective perception message: ETSI TS 103 324 V2.1.1 (`CPM-PDU-Descriptions`, version 1.1.1), of a vehicle or a roadside unit.
 
 use super::{
     GeodeticPoint, MessageError,
@@ -11,13 +11,15 @@ const TIMESTAMP: [i64; 2] = [0, 4_398_046_511_103];
 const CONTAINERS: [i64; 2] = [1, 8];
 const CONTAINER_ID: [i64; 2] = [1, 16];
 const ORIGINATING_VEHICLE: i64 = 1;
+const ORIGINATING_RSU: i64 = 2;
 const SENSOR_INFORMATION: i64 = 3;
 const PERCEIVED_OBJECTS: i64 = 5;
 const SENSORS: [i64; 2] = [1, 128];
 const SENSOR_KIND: [i64; 2] = [0, 31];
-/// `circular` among the six alternatives of `Shape`.
+/// Two of the six alternatives of `Shape`.
 const SHAPE: [i64; 2] = [0, 5];
 const CIRCULAR: i64 = 1;
+const RADIAL: i64 = 4;
 const LENGTH_12B: [i64; 2] = [0, 4095];
 const OBJECT_ID: [i64; 2] = [0, 65_535];
 const DELTA_TIME: [i64; 2] = [-2048, 2047];
@@ -62,7 +64,29 @@ pub struct PerceivedObject {
     pub is_person: bool,
 }
 
-/// A message of a vehicle.
+/// The station that perceives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum CpmOrigin {
+    /// A roadside unit.
+    #[default]
+    Roadside,
+    /// A vehicle.
+    Vehicle {
+        /// Its orientation, 0.1° clockwise from north.
+        heading: u16,
+    },
+}
+
+/// Where the sensor of a station sees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SensorRegion {
+    /// Range, 10 cm.
+    pub range_10cm: u16,
+    /// First and last angle of a sector, 0.1° counter-clockwise from the station's x axis (a roadside unit's is east); none = all around.
+    pub opening: Option<[u16; 2]>,
+}
+
+/// A message of a station that perceives.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Cpm {
     /// Station.
@@ -71,10 +95,10 @@ pub struct Cpm {
     pub reference_time_ms: u64,
     /// Reference position.
     pub position: GeodeticPoint,
-    /// Orientation of the vehicle, 0.1° clockwise from north.
-    pub heading: u16,
-    /// Range of its sensor in 10 cm, with the sensor information container.
-    pub sensor_range_10cm: Option<u16>,
+    /// What perceives.
+    pub origin: CpmOrigin,
+    /// Where its sensor sees, with the sensor information container.
+    pub sensor: Option<SensorRegion>,
     /// Objects that it perceives in all.
     pub perceived: u8,
     /// Included objects, at most 255.
@@ -91,9 +115,12 @@ impl Cpm {
         out.bits(0, 4);
         out.integer(self.reference_time_ms as i64, TIMESTAMP);
         write_position(&mut out, &self.position);
-        let mut containers = vec![(ORIGINATING_VEHICLE, self.vehicle())];
-        if let Some(range) = self.sensor_range_10cm {
-            containers.push((SENSOR_INFORMATION, sensor(range)));
+        let mut containers = vec![match self.origin {
+            CpmOrigin::Vehicle { heading } => (ORIGINATING_VEHICLE, vehicle(heading)),
+            CpmOrigin::Roadside => (ORIGINATING_RSU, roadside_unit()),
+        }];
+        if let Some(region) = self.sensor {
+            containers.push((SENSOR_INFORMATION, sensor(region)));
         }
         if !self.objects.is_empty() {
             containers.push((PERCEIVED_OBJECTS, self.perceived_objects()));
@@ -105,15 +132,6 @@ impl Cpm {
             out.open_type(content);
         }
         out.finish()
-    }
-
-    fn vehicle(&self) -> BitWriter {
-        let mut out = BitWriter::default();
-        // Extension, three optional parts.
-        out.bits(0, 4);
-        out.integer(self.heading.into(), HEADING);
-        out.integer(127, CONFIDENCE);
-        out
     }
 
     fn perceived_objects(&self) -> BitWriter {
@@ -153,8 +171,20 @@ impl Cpm {
             let id = input.integer("containerId", CONTAINER_ID)?;
             let mut content = input.open_type()?;
             match id {
-                ORIGINATING_VEHICLE => cpm.heading = read_vehicle(&mut content)?,
-                SENSOR_INFORMATION => cpm.sensor_range_10cm = Some(read_sensor(&mut content)?),
+                ORIGINATING_VEHICLE => {
+                    let heading = read_vehicle(&mut content)?;
+                    cpm.origin = CpmOrigin::Vehicle { heading };
+                }
+                ORIGINATING_RSU => {
+                    if content.bits(2)? != 0 {
+                        return Err(MessageError::Unsupported {
+                            what: "reference to a map",
+                            found: 1,
+                        });
+                    }
+                    cpm.origin = CpmOrigin::Roadside;
+                }
+                SENSOR_INFORMATION => cpm.sensor = Some(read_sensor(&mut content)?),
                 PERCEIVED_OBJECTS => (cpm.perceived, cpm.objects) = read_objects(&mut content)?,
                 _ => {
                     return Err(MessageError::Unsupported {
@@ -170,6 +200,22 @@ impl Cpm {
     }
 }
 
+fn vehicle(heading: u16) -> BitWriter {
+    let mut out = BitWriter::default();
+    // Extension, three optional parts.
+    out.bits(0, 4);
+    out.integer(heading.into(), HEADING);
+    out.integer(127, CONFIDENCE);
+    out
+}
+
+fn roadside_unit() -> BitWriter {
+    let mut out = BitWriter::default();
+    // Extension, no reference to a map.
+    out.bits(0, 2);
+    out
+}
+
 fn read_vehicle(input: &mut BitReader) -> Result<u16, MessageError> {
     if input.bits(4)? != 0 {
         return Err(MessageError::Unsupported {
@@ -182,8 +228,8 @@ fn read_vehicle(input: &mut BitReader) -> Result<u16, MessageError> {
     Ok(heading)
 }
 
-/// One sensor that sees all around: the aggregate of the vehicle's.
-fn sensor(range_10cm: u16) -> BitWriter {
+/// One sensor: the aggregate of the station's.
+fn sensor(region: SensorRegion) -> BitWriter {
     let mut out = BitWriter::default();
     out.flag(false);
     out.integer(1, SENSORS);
@@ -192,17 +238,29 @@ fn sensor(range_10cm: u16) -> BitWriter {
     out.integer(1, BYTE);
     // localAggregation.
     out.integer(12, SENSOR_KIND);
-    // Shape: extension, alternative. CircularShape: two optional parts.
+    // Shape: extension, alternative.
     out.flag(false);
-    out.integer(CIRCULAR, SHAPE);
-    out.bits(0, 2);
-    out.integer(range_10cm.into(), LENGTH_12B);
+    match region.opening {
+        // Two optional parts.
+        None => {
+            out.integer(CIRCULAR, SHAPE);
+            out.bits(0, 2);
+            out.integer(region.range_10cm.into(), LENGTH_12B);
+        }
+        // Three optional parts.
+        Some(opening) => {
+            out.integer(RADIAL, SHAPE);
+            out.bits(0, 3);
+            out.integer(region.range_10cm.into(), LENGTH_12B);
+            opening.iter().for_each(|angle| out.integer((*angle).into(), HEADING));
+        }
+    }
     // What stands behind an object is not seen.
     out.flag(true);
     out
 }
 
-fn read_sensor(input: &mut BitReader) -> Result<u16, MessageError> {
+fn read_sensor(input: &mut BitReader) -> Result<SensorRegion, MessageError> {
     let unsupported = |found| MessageError::Unsupported {
         what: "sensor information",
         found,
@@ -214,12 +272,27 @@ fn read_sensor(input: &mut BitReader) -> Result<u16, MessageError> {
     input.integer("sensorId", BYTE)?;
     input.integer("sensorType", SENSOR_KIND)?;
     input.no_extension("shape")?;
-    if input.integer("shape", SHAPE)? != CIRCULAR || input.bits(2)? != 0 {
-        return Err(unsupported(2));
+    let shape = input.integer("shape", SHAPE)?;
+    let optional_parts = match shape {
+        CIRCULAR => 2,
+        RADIAL => 3,
+        _ => return Err(unsupported(2)),
+    };
+    if input.bits(optional_parts)? != 0 {
+        return Err(unsupported(3));
     }
-    let range = input.integer("radius", LENGTH_12B)? as u16;
+    let range_10cm = input.integer("range", LENGTH_12B)? as u16;
+    let mut angle = || {
+        input
+            .integer("horizontalOpeningAngle", HEADING)
+            .map(|angle| angle as u16)
+    };
+    let opening = match shape {
+        RADIAL => Some([angle()?, angle()?]),
+        _ => None,
+    };
     input.flag()?;
-    Ok(range)
+    Ok(SensorRegion { range_10cm, opening })
 }
 
 fn read_objects(input: &mut BitReader) -> Result<(u8, Vec<PerceivedObject>), MessageError> {

@@ -1,6 +1,6 @@
 //! GeoNetworking and BTP headers of a single-hop broadcast: ETSI EN 302 636-4-1 V1.4.1, EN 302 636-5-1 V2.2.1, without security.
 
-use super::MessageError;
+use super::{MessageError, StationKind};
 
 /// Basic, common and single-hop broadcast header.
 const GEONETWORKING_BYTES: usize = 4 + 8 + 28;
@@ -49,10 +49,15 @@ pub fn encode(head: &PacketHead, message: &[u8]) -> Vec<u8> {
     // Basic header: version 1, a common header follows; lifetime 1 s (20 × 50 ms: multiplier 20 in units of 50 ms); one hop.
     out.extend([0x11, 0, 20 << 2, 1]);
     let length = (message.len() + 4) as u16;
-    // Common header: BTP-B follows; single-hop broadcast; traffic class 1 for warnings and 2 for all else; mobile; length of what follows;
-    // one hop.
+    // Common header: BTP-B follows; single-hop broadcast; traffic class 1 for warnings and 2 for all else; mobile or not; length of what
+    // follows; one hop.
     let traffic_class = if head.port == BtpPort::Denm { 1 } else { 2 };
-    out.extend([0x20, 0x50, traffic_class, 0x80]);
+    let flags = if head.kind == StationKind::ROADSIDE_UNIT.0 {
+        0
+    } else {
+        0x80
+    };
+    out.extend([0x20, 0x50, traffic_class, flags]);
     out.extend(length.to_be_bytes());
     out.extend([1, 0]);
     // Long position vector of the sender. Address: set by hand, the type of the station, a local MAC address.

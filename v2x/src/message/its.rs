@@ -18,6 +18,8 @@ impl StationKind {
     pub const HEAVY_TRUCK: Self = Self(8);
     /// A person on foot.
     pub const PEDESTRIAN: Self = Self(1);
+    /// A roadside unit.
+    pub const ROADSIDE_UNIT: Self = Self(15);
 }
 
 /// Latitude and longitude in 0.1 microdegrees, altitude in centimetres; `None` = unavailable.
@@ -52,6 +54,9 @@ const STATION: [i64; 2] = [0, 4_294_967_295];
 /// Milliseconds since the epoch of ITS, 2004-01-01 UTC, at the start of an episode. The year of the simulation is not known, so this is
 /// a constant: 2024-01-01, with the five leap seconds since 2004.
 const EPISODE_START_MS: u64 = 631_152_005_000;
+
+/// The same in seconds of Unix time.
+pub const EPISODE_START_UNIX_S: u64 = 1_704_067_200;
 
 /// `TimestampIts` of a time of the simulation, milliseconds.
 #[must_use]
@@ -167,6 +172,8 @@ mod tests {
     fn the_time_of_a_message_counts_from_2004() {
         // 2004-01-01 to 2024-01-01: 7305 days and five leap seconds.
         assert_eq!(its_time_ms(0), 7305 * 86_400_000 + 5000);
+        // 1970-01-01 to 2024-01-01, in a time without leap seconds: 19 723 days.
+        assert_eq!(EPISODE_START_UNIX_S, 19_723 * 86_400);
         assert_eq!(generation_delta_ms(65_536 + 7), 7);
     }
 }

@@ -9,11 +9,15 @@ pub mod cpm;
 pub mod denm;
 pub mod geonetworking;
 mod its;
+pub mod roadside_cam;
 mod uper;
 pub mod vam;
 pub mod wsmp;
 
-pub use its::{GeodeticPoint, StationKind, generation_delta_ms, heading_from_yaw, its_time_ms, yaw_from_heading};
+pub use its::{
+    EPISODE_START_UNIX_S, GeodeticPoint, StationKind, generation_delta_ms, heading_from_yaw, its_time_ms,
+    yaw_from_heading,
+};
 
 /// Bytes are not a message that this program reads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
