@@ -49,6 +49,7 @@ NAVIGATION = {
         "docs/networks",
         "docs/baselines",
         "docs/fusion",
+        "docs/cooperation",
         "docs/curriculum",
         "docs/parallel",
         "docs/paper",

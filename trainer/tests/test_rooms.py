@@ -16,7 +16,8 @@ MAY_IMPORT = {
     "run": {"ipc", "baselines", "tasks", "learn", "report"},
     "envs": {"ipc", "tasks", "run"},
     "fusion": {"ipc", "baselines", "tasks", "learn", "report", "run"},
-    "study": {"ipc", "baselines", "tasks", "learn", "report", "run", "fusion"},
+    "cooperation": {"ipc"},
+    "study": {"ipc", "baselines", "tasks", "learn", "report", "run", "fusion", "cooperation"},
     "examples": {"ipc", "tasks", "envs", "run"},
     "driving": {"ipc", "tasks", "learn", "run", "examples"},
 }

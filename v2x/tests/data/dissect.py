@@ -45,7 +45,7 @@ def check(frame: dict) -> str:
     if kind == "VAM" and "its" not in layers:
         return kind
     (station,) = values(layers["its"], "its.stationID")
-    # The last four bytes of both addresses are the station of the message, unless it is a warning that was sent once more.
+    # The last four bytes of both addresses are the station of the message, unless a warning is sent once more.
     address = layers["eth"]["eth.src"].replace(":", "")
     assert values(layers["gnw"], "geonw.src_pos.addr.mid") == [layers["eth"]["eth.src"]], layers
     assert kind == "DENM" or address == f"0200{int(station):08x}", (address, station)

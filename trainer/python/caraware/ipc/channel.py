@@ -297,7 +297,7 @@ class Neighbours:
 
     @cached_property
     def ids(self) -> UInt32Array:
-        """u32 [n, k, 3]: station of the object (0: perceived), station heard from, 1 CAM, 2 CPM, 3 VAM, 4 BSM or 5 own."""
+        """u32 [n, k, 3]: its station (0: perceived), station heard from, 1 CAM, 2 CPM, 3 VAM, 4 BSM, 5 own sensors."""
         return self._array("ids", np.uint32)
 
     @cached_property

@@ -24,6 +24,10 @@ from caraware.ipc.stream import EMPTY_SLOT, Observation
 FOLDER = "recording"
 TENSORS = ("observation", "truth", "gnss_m", "imu", "speed_steering")
 ARRAYS = ("gnss_quality", "sensors", "vehicle", "age_s", "episode_step", "valid", "terminated", "truncated")
+MESSAGES = {"neighbour_objects": "objects", "neighbour_ids": "ids", "neighbour_radio": "radio"}
+"""Arrays of a run with messages, and their names in `Observation.neighbours`."""
+FLOATS = {"neighbour_objects": np.float32}
+"""Arrays of messages that are not u32."""
 SCALARS = ("tick", "sim_time_ns", "evaluation", "last", "episode_last", "lesson_last", "stage")
 
 
@@ -52,6 +56,12 @@ class RecordedTick:
     valid: BoolArray
     terminated: BoolArray
     truncated: BoolArray
+    neighbour_objects: Float32Array
+    """f32 `[n, k, 11]`, `caraware.ipc.channel.Neighbours.objects`; `[n, 0, 11]` of a run without messages."""
+    neighbour_ids: UInt32Array
+    """u32 `[n, k, 3]`."""
+    neighbour_radio: UInt32Array
+    """u32 `[n, 5]`."""
 
     @property
     def ended_by(self) -> UInt32Array:
@@ -69,21 +79,33 @@ class EpisodeWriter:
     """Collects the ticks of an episode and writes them as one file."""
 
     folder: Path
+    has_messages: bool = False
     ticks: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, obs: Observation) -> None:
         """Copy one tick; the last one of an episode writes the file."""
         row = {name: np.asarray(getattr(obs, name)).copy() for name in (*TENSORS, *ARRAYS)}
+        row |= self._messages(obs)
         self.ticks.append(row | {name: getattr(obs, name) for name in SCALARS})
         if obs.episode_last or obs.last:
             self.write(obs.episode)
+
+    def _messages(self, obs: Observation) -> dict[str, Any]:
+        if not self.has_messages:
+            shapes = {"neighbour_objects": (0, 11), "neighbour_ids": (0, 3), "neighbour_radio": (5,)}
+            return {
+                name: np.zeros((len(obs.vehicle), *shape), FLOATS.get(name, np.uint32))
+                for name, shape in shapes.items()
+            }
+        neighbours = getattr(obs, "neighbours")  # noqa: B009  # only an observation of shared memory has them
+        return {name: np.asarray(getattr(neighbours, of)).copy() for name, of in MESSAGES.items()}
 
     def write(self, episode: int) -> None:
         """Write what is there. Slots only become more: earlier ticks are filled up with empty ones."""
         ticks, self.ticks = self.ticks, []
         slots = max(len(tick["vehicle"]) for tick in ticks)
         columns: dict[str, Any] = {name: np.array([tick[name] for tick in ticks]) for name in SCALARS}
-        for name in (*TENSORS, *ARRAYS):
+        for name in (*TENSORS, *ARRAYS, *MESSAGES):
             first = ticks[0][name]
             whole = np.zeros((len(ticks), slots, *first.shape[1:]), first.dtype)
             for row, tick in zip(whole, ticks, strict=True):
@@ -122,7 +144,7 @@ def _ticks(episode: int, columns: dict[str, Any]) -> list[RecordedTick]:
     for t in range(len(columns["tick"])):
         values: dict[str, Any] = {name: columns[name][t].item() for name in SCALARS}
         values |= {name: torch.from_numpy(columns[name][t]) for name in TENSORS}
-        values |= {name: columns[name][t] for name in ARRAYS}
+        values |= {name: columns[name][t] for name in (*ARRAYS, *MESSAGES)}
         ticks.append(RecordedTick(episode=episode, **values))
     return ticks
 
@@ -137,8 +159,10 @@ def main(run_file: str) -> None:
         signal.signal(number, lambda number, _: stop.append(number))
     torch.set_num_threads(1)
     attachment = _native.Attachment(run_file)
-    run_dir = Path(json.loads(attachment.run_json)["run_dir"])
-    writer, env_steps, ticks = EpisodeWriter(run_dir / FOLDER), 0, 0
+    run = json.loads(attachment.run_json)
+    run_dir = Path(run["run_dir"])
+    writer = EpisodeWriter(run_dir / FOLDER, has_messages=run["config"]["v2x"]["share"] > 0)
+    env_steps, ticks = 0, 0
     while not attachment.ended and not stop:
         for obs in map(SharedObservation, attachment.receive(0.2)):
             writer.add(obs)

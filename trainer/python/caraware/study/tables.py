@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from caraware.run.program import caraware_program
+from caraware.study.cooperation import ESTIMATORS as COOPERATION_ESTIMATORS
+from caraware.study.cooperation import errors_by_episode
 from caraware.study.fusing import FusionComparison
 from caraware.study.recording import FOLDER, Recording
 from caraware.study.regression import Comparison, same_steps
@@ -20,6 +22,9 @@ Measured = dict[str, list[float]]
 """Values of each figure (m), one for each independent seed: of an evaluation, or of a learner."""
 
 FUSION_EVALUATIONS, TOWN_EVALUATIONS = 5, 4
+COOPERATION_EVALUATIONS = 5
+COOPERATION_SHARES = (0.1, 0.3, 0.5, 1.0)
+"""Shares of the vehicles with a radio."""
 DEFAULT_NOISE = ("gnss.correlated_std_m=0.0", "blackout.enabled=false")
 SENSORS: Mapping[str, tuple[str, ...]] = {"default_noise": DEFAULT_NOISE, "faults": ()}
 """Settings beside the preset `fusion`, which has a slow error of fixes and blackouts."""
@@ -70,9 +75,29 @@ def regression(options: Options) -> Measured:
     return {"regression": [each.mean_m for seed in options.seeds for each in same_steps(of, seed, ppo=False)]}
 
 
+def cooperation(options: Options) -> Measured:
+    """Estimators with others' help, at several shares of vehicles with a radio: five evaluation seeds, each one value.
+
+    Without radios no message is sent, and `raw` and `ekf` at full share are what is known.
+    """
+    measured: Measured = {}
+    for share in COOPERATION_SHARES:
+        settings = [f"v2x.share={share}"]
+        errors = errors_by_episode(
+            recorded(options, "cooperation", f"share-{share}", settings), COOPERATION_EVALUATIONS
+        )
+        for name in COOPERATION_ESTIMATORS:
+            measured[f"{share}.{name}"] = [each[name] for each in errors]
+        # Each seed's own ratio: all estimators see the same ticks.
+        for name, by in (("cooperative", "ekf"), ("cooperative", "implicit"), ("smoother", "ekf")):
+            measured[f"{share}.{name}_by_{by}"] = [each[name] / each[by] for each in errors]
+    return measured
+
+
 TABLES: Mapping[str, Table] = {
     "filters": Table("docs/baselines.md", "the filters with and without a map", filters),
     "regression": Table("docs/baselines.md", "regression with PPO's samples and gradient steps", regression),
+    "cooperation": Table("docs/cooperation.md", "localisation with others' help", cooperation),
     "fusion": Table("docs/fusion.md", "the learned estimator beside the filters", fusion),
 }
 
