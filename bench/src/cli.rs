@@ -23,6 +23,9 @@ pub enum BenchPart {
     Scale,
     /// Vehicle-steps per second, compared with Python loops over TraCI and libsumo, with MetaDrive and with SMARTS
     Peers,
+    /// Messages: delivery over distance, channel load, awareness over the share of radios, age, redundancy, sizes, error after fusion
+    #[value(name = "v2x")]
+    V2x,
     /// Driving: a fixed list of held-out trips with a random driver, the script, SUMO's own driver, and a learnt policy (`--policy`)
     Driving,
     /// Recording: wall time of a run that is recorded, as a watcher and without loss, compared with the same run alone
@@ -33,7 +36,7 @@ pub enum BenchPart {
     Endurance,
     /// Soak: growth of memory, handles and logs of one long run with viewers and handovers
     Soak,
-    /// All of these but driving, endurance and soak, one after the other
+    /// All of these but v2x, driving, endurance and soak, one after the other
     All,
 }
 
@@ -45,7 +48,7 @@ impl BenchPart {
 
     /// The parts of `all`: those that measure a speed.
     pub fn speeds() -> impl Iterator<Item = Self> {
-        Self::measured().filter(|part| !matches!(part, Self::Driving | Self::Endurance | Self::Soak))
+        Self::measured().filter(|part| !matches!(part, Self::V2x | Self::Driving | Self::Endurance | Self::Soak))
     }
 
     /// Its name on the command line.

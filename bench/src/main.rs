@@ -22,6 +22,7 @@ mod soak;
 mod stages;
 mod target;
 mod trainer;
+mod v2x;
 mod watch;
 
 use std::{io::Write as _, path::PathBuf, process::ExitCode};
@@ -134,6 +135,7 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
         BenchPart::Peers => peers::measure(options),
         BenchPart::Record => record::measure(options),
         BenchPart::Watch => watch::measure(options),
+        BenchPart::V2x => v2x::measure(options),
         BenchPart::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

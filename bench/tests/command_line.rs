@@ -27,6 +27,7 @@ fn the_help_shows_the_command_and_every_part() {
         "peers",
         "record",
         "watch",
+        "v2x",
         "endurance",
         "soak",
         "all",
@@ -61,6 +62,27 @@ fn a_recorder_that_watches_is_measured_within_one_run() {
         }
     }
     assert!(report["figures"]["MB/s of messages"].as_f64().unwrap() > 0.0, "{text}");
+}
+
+/// More radios and collective perception make more of the others known, and cost the channel more.
+#[test]
+fn the_curves_of_messages_go_the_way_they_must() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let (code, text) = answer(&["v2x", "--quick", "--json", file.path().to_str().unwrap()]);
+    assert_eq!(code, Some(0), "{text}");
+    let report: serde_json::Value = serde_json::from_reader(file).unwrap();
+    let figure = |case: &str, what: &str| report["figures"][format!("{case}: {what}")].as_f64().unwrap();
+    let cases = [
+        "CAM, 50 % with a radio",
+        "CAM, 100 % with a radio",
+        "CAM and CPM, 100 % with a radio",
+    ];
+    for what in ["channel busy ratio", "awareness within 100 m"] {
+        let values = cases.map(|case| figure(case, what));
+        assert!(0.0 < values[0] && values[0] < values[1], "{what}: {values:?}");
+        assert!(values[1] < values[2] && values[2] <= 1.0, "{what}: {values:?}");
+    }
+    assert!(figure(cases[2], "error after fusion, m") < figure(cases[1], "error after fusion, m"));
 }
 
 /// Every kind of disturbance happens: the runs must end as the undisturbed ones.

@@ -79,8 +79,8 @@ struct Looks {
 /// Sizes of CPMs by their number of objects: bytes and messages.
 type Sizes = BTreeMap<usize, [u64; 2]>;
 
-/// Measures and prints the curves.
-pub fn print(is_quick: bool) {
+/// Measures the curves, and writes them into a file, or to standard output without one.
+pub fn measure_all(is_quick: bool, file: Option<&str>) {
     let (vehicles, seconds, shares): (usize, u64, &[f64]) = match is_quick {
         true => (60, 2, &[0.5, 1.0]),
         false => (250, 10, &[0.1, 0.3, 0.5, 0.7, 1.0]),
@@ -120,7 +120,11 @@ pub fn print(is_quick: bool) {
             .map(|(objects, [bytes, messages])| [*objects as f64, *bytes as f64 / *messages as f64, *messages as f64])
             .collect(),
     };
-    println!("{}", serde_json::to_string(&curves).unwrap());
+    let text = serde_json::to_string(&curves).unwrap();
+    match file {
+        Some(path) => std::fs::write(path, text).unwrap(),
+        None => println!("{text}"),
+    }
 }
 
 fn measure(

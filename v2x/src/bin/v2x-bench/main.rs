@@ -1,6 +1,6 @@
 //! Delivery over distance, channel load, age of information and awareness in a grid of streets with houses between them; and its cost.
 //!
-//! `v2x-bench [--quick]` writes the figures of `caraware bench v2x` as JSON. `v2x-bench cost [STATIONS …] [--threads=N] [--cam]` measures
+//! `v2x-bench [--quick] [--json FILE]` writes the figures of `caraware bench v2x`. `v2x-bench cost [STATIONS …] [--threads=N] [--cam]` measures
 //! the cost of the exchange: CAMs alone, then CAMs and CPMs (not with `--cam`). Its hash is over every block of neighbours: what is computed
 //! in another way has the same.
 
@@ -18,6 +18,10 @@ fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match arguments.first().map(String::as_str) {
         Some("cost") => cost::measure_all(&arguments[1..]),
-        _ => curves::print(arguments.iter().any(|argument| argument == "--quick")),
+        _ => {
+            let is_quick = arguments.iter().any(|argument| argument == "--quick");
+            let file = arguments.iter().skip_while(|argument| *argument != "--json").nth(1);
+            curves::measure_all(is_quick, file.map(String::as_str));
+        }
     }
 }
