@@ -315,7 +315,8 @@ fn contacts_are_flagged_published_written_and_counted() {
     let part = std::fs::read_to_string(run.file.run_dir.join("parts/sim-core.json")).unwrap();
     let part: Value = serde_json::from_str(&part).unwrap();
     let counts = serde_json::json!({
-        "total": 2, "vehicle": 0, "vehicle_in_sumo": 0, "person": 0, "building": 1, "obstacle": 1, "without_line": 0
+        "total": 2, "vehicle": 0, "vehicle_in_sumo": 0, "person": 0, "building": 1, "obstacle": 1, "without_line": 0,
+        "own": {"led": 0, "lane_change": 0, "late": 0, "path": 0, "tracking": 0, "body": 0}
     });
     assert_eq!(
         (&part["collisions"], &part["buildings"], &part["props"]),

@@ -217,3 +217,89 @@ fn with_a_preview_vehicles_are_led_where_they_cannot_drive() {
         }
     }
 }
+
+/// Trips between roads of a grid of `side` junctions that are drawn by a fixed rule, one every 0.6 s.
+fn grid_trips(side: u32, count: u32) -> String {
+    let name = |place: u32| {
+        format!(
+            "{}{}",
+            char::from(b'A' + u8::try_from(place % side).unwrap()),
+            place / side
+        )
+    };
+    let roads: Vec<String> = (0..side * side)
+        .flat_map(|place| {
+            let east = (place % side + 1 < side).then_some(place + 1);
+            let north = (place / side + 1 < side).then_some(place + side);
+            [east, north].into_iter().flatten().map(move |next| (place, next))
+        })
+        .flat_map(|(a, b)| [format!("{}{}", name(a), name(b)), format!("{}{}", name(b), name(a))])
+        .collect();
+    let mut drawn = 1_u64;
+    let mut draw = || {
+        drawn = drawn
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        &roads[usize::try_from(drawn >> 33).unwrap() % roads.len()]
+    };
+    let mut trips = String::new();
+    for trip in 0..count {
+        let (from, to, depart) = (draw(), draw(), f64::from(trip) * 0.6);
+        writeln!(
+            trips,
+            "<trip id=\"{trip}\" depart=\"{depart:.1}\" from=\"{from}\" to=\"{to}\"/>"
+        )
+        .unwrap();
+    }
+    trips
+}
+
+/// Corners, queues and turnarounds as netgenerate makes them. A mirror that cuts a corner touches who waits for a turnaround there.
+#[test]
+fn mirrors_do_not_touch_where_sumo_has_them_apart() {
+    let workplace = Workplace::new();
+    let grid = [
+        "--grid",
+        "--grid.number",
+        "4",
+        "--grid.length",
+        "100",
+        "-o",
+        "d.net.xml",
+    ];
+    tool(&sumo_program("netgenerate"), &grid, workplace.path());
+    workplace.write("d.rou.xml", &format!("<routes>{}</routes>", grid_trips(4, 300)));
+    for (name, step_s) in [("tenths", 0.1), ("seconds", 1.0)] {
+        let input = "<net-file value=\"d.net.xml\"/><route-files value=\"d.rou.xml\"/>";
+        let time = format!("<time><end value=\"240\"/><step-length value=\"{step_s}\"/></time>");
+        workplace.write(
+            "d.sumocfg",
+            &format!("<configuration><input>{input}</input>{time}</configuration>"),
+        );
+        let settings = [
+            "fanout.enabled=false",
+            "collision.detect=true",
+            "map.origin_latitude_deg=52",
+            "map.origin_longitude_deg=10",
+        ];
+        let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+        let arguments: Vec<&str> = ["simulate", "d.sumocfg", "--name", name]
+            .into_iter()
+            .chain(settings)
+            .collect();
+        workplace.succeed(&arguments);
+        let dynamics = &workplace.report(name)["dynamics"];
+        assert!(dynamics["vehicle_steps"].as_u64().unwrap() > 80_000, "{dynamics:#}");
+        assert_eq!(dynamics["resynchronisations"], 0, "{dynamics:#}");
+        let contacts = &dynamics["collisions"];
+        let own: u64 = contacts["own"]
+            .as_object()
+            .unwrap()
+            .values()
+            .map(|count| count.as_u64().unwrap())
+            .sum();
+        let of_sumo = contacts["vehicle_in_sumo"].as_u64().unwrap();
+        assert_eq!(contacts["vehicle"], own + of_sumo, "{contacts:#}");
+        assert_eq!(own, 0, "{contacts:#}");
+    }
+}

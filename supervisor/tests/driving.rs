@@ -305,6 +305,25 @@ fn leaving_the_road_terminates_and_the_time_limit_truncates() {
     assert_eq!(lived, 60);
 }
 
+/// SUMO gives no slope to a vehicle that is beside the road.
+#[test]
+fn a_hero_that_leaves_a_road_uphill_ends_its_trip_and_not_the_run() {
+    let workplace = Workplace::new();
+    scenario(
+        &workplace,
+        "<node id=\"a\" x=\"0\" y=\"0\" z=\"0\"/><node id=\"b\" x=\"1000\" y=\"0\" z=\"80\"/>",
+        "<edge id=\"road\" from=\"a\" to=\"b\" speed=\"20\"/>",
+        "<route id=\"r\" edges=\"road\"/><vehicle id=\"h\" route=\"r\" depart=\"0\" departPos=\"100\" departSpeed=\"15\"/>",
+        10,
+    );
+    let report = drive(&workplace, "uphill", r#"{"0": null, "2": [0.3, 0]}"#);
+    assert_eq!(
+        report["dynamics"]["heroes"]["off_road"], 2,
+        "{:#}",
+        report["dynamics"]["heroes"]
+    );
+}
+
 #[test]
 fn an_action_that_is_not_finite_or_out_of_range_is_refused_and_the_last_one_is_held() {
     let workplace = Workplace::new();

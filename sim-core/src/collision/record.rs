@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     event_log::EventLog,
-    mirror::Mirror,
+    mirror::{Mirror, departure::ContactCause},
     names::RoadUserNames,
     scene::{
         Scene, Solid,
@@ -38,6 +38,9 @@ pub struct CollisionCounts {
     /// Of these, those that SUMO's own poses have too.
     #[serde(default)]
     pub vehicle_in_sumo: u64,
+    /// Of these, those of the mirrors alone, by what explains them.
+    #[serde(default)]
+    pub own: OwnContactCounts,
     /// With persons.
     pub person: u64,
     /// With buildings.
@@ -47,6 +50,36 @@ pub struct CollisionCounts {
     /// Of all, those without a line in `events/collisions.jsonl`: the disk was full, or the file had its largest size.
     #[serde(default)]
     pub without_line: u64,
+}
+
+/// Contacts of two vehicles that SUMO's own poses do not have, by [`ContactCause`].
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OwnContactCounts {
+    /// See [`ContactCause::Led`], and so on.
+    pub led: u64,
+    /// A lane change takes time.
+    pub lane_change: u64,
+    /// Late for a bend.
+    pub late: u64,
+    /// The path is beside SUMO's.
+    pub path: u64,
+    /// Not on the path.
+    pub tracking: u64,
+    /// The shape of the bodies.
+    pub body: u64,
+}
+
+impl OwnContactCounts {
+    fn add(&mut self, cause: ContactCause) {
+        *match cause {
+            ContactCause::Led => &mut self.led,
+            ContactCause::LaneChange => &mut self.lane_change,
+            ContactCause::Late => &mut self.late,
+            ContactCause::Path => &mut self.path,
+            ContactCause::Tracking => &mut self.tracking,
+            ContactCause::Body => &mut self.body,
+        } += 1;
+    }
 }
 
 impl CollisionCounts {
@@ -88,6 +121,9 @@ struct CollisionLine<'a> {
     /// Of two vehicles: whether SUMO's own poses overlap at that time too.
     #[serde(skip_serializing_if = "Option::is_none")]
     in_sumo: Option<bool>,
+    /// If they do not: what explains the contact.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cause: Option<ContactCause>,
 }
 
 /// How a road user was in a contact.
@@ -208,10 +244,15 @@ impl ContactReporter {
                 .then(|| overlap_in_sumo(mirror, [collision.vehicle, collision.other]));
             self.counts.add(collision.other_class);
             self.counts.vehicle_in_sumo += u64::from(in_sumo == Some(true));
-            let body = |vehicle: u32| {
-                let state = states.iter().find(|state| state.vehicle == vehicle);
-                state.map(|state| ContactBody::of(state, collision.position_m))
+            let state = |vehicle: u32| states.iter().find(|state| state.vehicle == vehicle);
+            let cause = match (in_sumo, state(collision.vehicle), state(collision.other)) {
+                (Some(false), Some(a), Some(b)) => Some(mirror.contact_cause([a, b])),
+                _ => None,
             };
+            if let Some(cause) = cause {
+                self.counts.own.add(cause);
+            }
+            let body = |vehicle: u32| state(vehicle).map(|state| ContactBody::of(state, collision.position_m));
             let Some(own) = body(collision.vehicle) else { continue };
             let is_road_user = [Struck::Vehicle, Struck::Person]
                 .map(|class| class as u32)
@@ -230,6 +271,7 @@ impl ContactReporter {
                 own,
                 struck,
                 in_sumo,
+                cause,
             })?;
         }
         Ok(())
@@ -246,7 +288,7 @@ impl ContactReporter {
     }
 }
 
-/// True if SUMO itself has both vehicles in one place in the frames that the mirror moves through: SUMO lets bodies overlap where lanes
+/// True if SUMO itself has both vehicles in one place at the mirrors' time, a frame more or less: SUMO lets bodies overlap where lanes
 /// meet.
 fn overlap_in_sumo(mirror: &Mirror, vehicles: [u32; 2]) -> bool {
     let [a, b] = vehicles.map(|vehicle| mirror.sumo_boxes(vehicle));

@@ -28,7 +28,12 @@ pub const BATCH: usize = 16;
 /// Shares of a vehicle's friction and steering that references use, as [`POWER_SHARE`] of its power; the tracker uses the rest to follow them.
 const LATERAL_SHARE: f64 = 0.6;
 const LONGITUDINAL_SHARE: f64 = 0.85;
+/// With a preview the reference does not surprise the tracker. SUMO's own paths ask for more than the friction at their worst.
+const PREVIEW_LATERAL_SHARE: f64 = 0.66;
 const CURVATURE_SHARE: f64 = 0.9;
+
+/// Share of the distance out of a bend that would bring the middle of the body to SUMO's: the rest keeps the front bumper in its lane.
+const SWING_SHARE: f64 = 0.4;
 
 /// Time between two demands of the tracker, seconds.
 const DEMAND_S: f64 = 0.02;
@@ -52,6 +57,8 @@ pub trait BatchModel<const N: usize>: Pod {
     fn rear_wheel_slip(&self, state: &ModelState, slope_sin: f64) -> f64;
     /// The limits that a reference respects.
     fn driving_limits(&self) -> DrivingLimits;
+    /// The same with a preview.
+    fn preview_limits(&self) -> DrivingLimits;
     /// Parameters that keep the numbers of an empty member finite.
     fn empty() -> [f64; N];
 }
@@ -88,6 +95,10 @@ impl BatchModel<KINEMATIC> for KinematicParams {
         }
     }
 
+    fn preview_limits(&self) -> DrivingLimits {
+        self.driving_limits()
+    }
+
     fn empty() -> [f64; KINEMATIC] {
         [1.0; KINEMATIC]
     }
@@ -121,6 +132,13 @@ impl BatchModel<DYNAMIC> for DynamicParams {
         }
     }
 
+    fn preview_limits(&self) -> DrivingLimits {
+        DrivingLimits {
+            lateral_mps2: PREVIEW_LATERAL_SHARE * self.friction * GRAVITY_MPS2,
+            ..self.driving_limits()
+        }
+    }
+
     fn empty() -> [f64; DYNAMIC] {
         [0.25; DYNAMIC]
     }
@@ -129,11 +147,14 @@ impl BatchModel<DYNAMIC> for DynamicParams {
 /// What a vehicle can drive.
 pub(super) fn path_limits(vehicle: &SizedModel) -> PathLimits {
     let (driving, rear_per_m) = match &vehicle.model {
-        MotionModel::Kinematic(params) => (params.driving_limits(), params.max_curvature_per_m),
-        MotionModel::Dynamic(params) => (params.driving_limits(), params.max_curvature_per_m),
+        MotionModel::Kinematic(params) => (params.preview_limits(), params.max_curvature_per_m),
+        MotionModel::Dynamic(params) => (params.preview_limits(), params.max_curvature_per_m),
     };
-    let turn = rear_per_m * vehicle.dimensions.front_m();
+    let (front_m, length_m) = (vehicle.dimensions.front_m(), vehicle.dimensions.length_m);
+    let turn = rear_per_m * front_m;
     PathLimits {
+        // In a circle of radius R whose front bumper is `swing / R` outside SUMO's, both bodies have their middle in one place.
+        swing_m2: SWING_SHARE * 0.5 * length_m * (front_m - 0.5 * length_m).max(0.0),
         driving,
         front_curvature_per_m: rear_per_m / (1.0 + turn * turn).sqrt(),
     }

@@ -57,17 +57,31 @@ pub const UNLIMITED: DrivingLimits = DrivingLimits {
     rolling_mps2: 0.0,
 };
 
+/// Whether a vehicle's path turns more narrowly than it can.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NarrowTurn {
+    /// Not near it.
+    None,
+    /// Near it: no driving returns the vehicle to the path there.
+    Near,
+    /// It begins here, and is far too narrow: the vehicle is led from its beginning, before it is off the path.
+    Begins,
+}
+
 /// Why a vehicle has to be guided that is `away_m` from its reference and path, with `lane_change_m` of a lane change left.
 #[must_use]
 pub fn cause(
     state: &ModelState,
     [error_m, undriven_m]: [f64; 2],
     lane_change_m: f64,
-    is_narrow: bool,
+    turn: NarrowTurn,
 ) -> Option<ResynchronisationCause> {
+    let is_narrow = turn != NarrowTurn::None;
     let most_m = if is_narrow { BEGIN_NARROW_M } else { BEGIN_M };
     if state.speed_mps < SLOW_MPS && lane_change_m > BEGIN_LANE_CHANGE_M {
         Some(ResynchronisationCause::SlowLaneChange)
+    } else if turn == NarrowTurn::Begins {
+        Some(ResynchronisationCause::NarrowTurn)
     } else if error_m + undriven_m <= most_m {
         None
     } else if is_narrow {

@@ -14,6 +14,7 @@ use ipc_schema::{
 
 pub mod batch;
 pub mod curve;
+pub mod departure;
 pub mod governor;
 pub mod guidance;
 pub mod hero;
@@ -41,6 +42,7 @@ use crate::{
     scene::shape::OrientedBox,
 };
 use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, path_limits};
+use departure::{ContactCause, Departure};
 use pace::PathLimits;
 use prefetch::PrefetchRange;
 use preview::PathAhead;
@@ -198,7 +200,22 @@ impl Mirror {
         &self.guidances
     }
 
-    /// The boxes in which SUMO has a road user in the frames that the mirror moves through, newest first; empty if it is not known.
+    /// What explains that two mirrors touch, as their states of the last tick describe them, where SUMO has them apart.
+    #[must_use]
+    pub fn contact_cause(&self, states: [&VehicleState; 2]) -> ContactCause {
+        let [a, b] = states.map(|state| self.departure(state).cause());
+        a.min(b)
+    }
+
+    fn departure(&self, state: &VehicleState) -> Departure {
+        let place = self.place(state.vehicle).map_or(usize::MAX, |place| place as usize);
+        let road_user = self.slab.get(place);
+        road_user.map_or_else(Departure::default, |road_user| {
+            road_user.departure(self.paths.get(place), state)
+        })
+    }
+
+    /// The boxes in which SUMO has a road user at the mirror's time, a frame more or less, newest first; empty if it is not known.
     #[must_use]
     pub fn sumo_boxes(&self, vehicle: u32) -> Vec<OrientedBox> {
         let place = self.place(vehicle).map_or(usize::MAX, |place| place as usize);

@@ -4,7 +4,7 @@
 //! knows the path ahead. Where the aim's speed asks for more lateral acceleration than the tyres should give, the mirror brakes *before*
 //! the bend and stays on the path. It falls behind its aim meanwhile, and drives faster afterwards, within what the vehicle can do.
 
-use ipc_schema::traffic::TrafficState;
+use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
 
 use super::{governor::DrivingLimits, window::WindowStep};
 use crate::trig::wrap_angle;
@@ -21,6 +21,19 @@ const BRAKE_MPS2: f64 = 3.5;
 const CATCH_UP_PER_S: f64 = 0.5;
 /// Distance from a narrow turn within which it is the reason for what goes wrong, metres.
 const NARROW_REACH_M: f64 = 12.0;
+/// A path that turns this much more narrowly than the vehicle can is not tried: the vehicle is led from its beginning.
+const FAR_TOO_NARROW: f64 = 1.4;
+/// Frames before such a turn at which guidance begins.
+const NARROW_FRAMES: usize = 3;
+/// Distance, and time at the aim's speed, by which a mirror may be late for a bend; at twice as much it keeps pace and may have to be led.
+const MOST_LATE_M: f64 = 2.0;
+const MOST_LATE_S: f64 = 0.15;
+/// Distance ahead and behind over which a bend is measured, metres.
+const BEND_REACH_M: f64 = 2.0;
+/// Turns below this are straight, radians.
+const STRAIGHT_RAD: f64 = 1e-4;
+/// Largest distance by which a mirror's place is moved out of a bend, metres.
+const MOST_OUTSIDE_M: f64 = 1.2;
 /// Points of the path are at least so far apart, metres: nearer ones have no direction.
 const APART_M: f64 = 0.02;
 
@@ -31,6 +44,8 @@ pub struct PathLimits {
     pub driving: DrivingLimits,
     /// Largest curvature of the front bumper's path, 1/m.
     pub front_curvature_per_m: f64,
+    /// By how much the front bumper moves out of a bend, by the curvature, so that the body is nearer to where SUMO has it, m².
+    pub swing_m2: f64,
 }
 
 /// A mean of SUMO's states on the path.
@@ -47,6 +62,8 @@ struct PathPoint {
     /// Distance from SUMO's own path, metres.
     deviation_m: f32,
     lamps: u32,
+    /// The path turns far too narrowly here.
+    is_narrow: bool,
 }
 
 /// A road user's path and its progress on it.
@@ -57,6 +74,10 @@ pub struct PacedPath {
     newest: usize,
     /// Frames by which the aim is behind the newest point.
     late: usize,
+    /// By how much the mean cuts a corner: half the variance of the frames that it is made of, squared frames.
+    cut_frames2: f64,
+    /// Distance of the mirror's place from the mean, out of the bend, metres.
+    outside_m: f64,
     /// Station of the mirror and its speed.
     station_m: f64,
     speed_mps: f64,
@@ -70,13 +91,16 @@ pub struct PacedPath {
 }
 
 impl PacedPath {
-    /// A path whose mirror is `late` frames behind the newest point. It belongs to no road user yet.
+    /// A path of the means over a window. It belongs to no road user yet.
     #[must_use]
-    pub fn new(late: usize) -> Self {
+    pub fn new(frames: PreviewFrames) -> Self {
+        let (late, window) = (frames.late, frames.window_states as f64);
         Self {
             points: vec![PathPoint::default(); late + MOST_LATE + 2],
             newest: 0,
             late,
+            cut_frames2: (window * window - 1.0) / 24.0,
+            outside_m: 0.0,
             station_m: 0.0,
             speed_mps: 0.0,
             ahead: late,
@@ -106,8 +130,10 @@ impl PacedPath {
                 bend_square: f32::INFINITY,
                 deviation_m: 0.0,
                 lamps: mean.signals,
+                is_narrow: false,
             };
         }
+        self.outside_m = 0.0;
         self.newest = count - 1;
         self.direction = [0.0; 2];
         self.ahead = self.late;
@@ -147,9 +173,13 @@ impl PacedPath {
             None => (aim_m, aim_mps),
             Some(limits) => {
                 let wanted_mps = aim_mps + CATCH_UP_PER_S * (aim_m - self.station_m);
+                let bend_mps = self.bend_speed_mps();
+                let most_late_m = MOST_LATE_M + MOST_LATE_S * aim_mps;
+                let share = ((aim_m - self.station_m) / most_late_m - 1.0).clamp(0.0, 1.0);
+                let bend_mps = bend_mps + share * (aim_mps - bend_mps).max(0.0);
                 let [most_accel, most_decel, _] = limits.driving.at(self.speed_mps.max(1.0));
                 let speed_mps = wanted_mps
-                    .min(self.bend_speed_mps())
+                    .min(bend_mps)
                     .clamp(
                         self.speed_mps - LONGITUDINAL_SHARE * most_decel * frame_s,
                         self.speed_mps + LONGITUDINAL_SHARE * most_accel * frame_s,
@@ -163,6 +193,9 @@ impl PacedPath {
         };
         self.find_ahead();
         self.now = self.state(&step.now);
+        if let Some(limits) = limits {
+            self.move_outside(limits.swing_m2);
+        }
         WindowStep {
             before,
             now: self.now,
@@ -176,10 +209,22 @@ impl PacedPath {
         (self.station_m - self.narrow_m).abs() < NARROW_REACH_M
     }
 
-    /// Distance of the mirror's place on the path from SUMO's own path, metres.
+    /// True where the path begins to turn so narrowly that the vehicle has to be led.
+    #[must_use]
+    pub fn turns_narrowly(&self) -> bool {
+        self.behind(self.ahead.saturating_sub(NARROW_FRAMES)).is_narrow
+    }
+
+    /// Distance along the path by which the mirror is later than it should be, metres.
+    #[must_use]
+    pub fn late_m(&self) -> f64 {
+        self.behind(self.late).station_m - self.station_m
+    }
+
+    /// Distance of the mirror's place from SUMO's own path, metres.
     #[must_use]
     pub fn deviation_m(&self) -> f64 {
-        self.behind(self.ahead).deviation_m.into()
+        (f64::from(self.behind(self.ahead).deviation_m) - self.outside_m).abs()
     }
 
     /// The point `frames` before the newest.
@@ -202,7 +247,7 @@ impl PacedPath {
         let chord = [0, 1].map(|axis: usize| position_m[axis] - last.position_m[axis]);
         let length_m = (chord[0] * chord[0] + chord[1] * chord[1]).sqrt();
         let station_m = last.station_m + length_m;
-        let mut bend_square = last.bend_square;
+        let (mut bend_square, mut is_narrow) = (last.bend_square, last.is_narrow);
         if length_m > APART_M {
             let per_m = 1.0 / length_m;
             let [ahead, left] = chord.map(|part| part * per_m);
@@ -214,7 +259,10 @@ impl PacedPath {
                 bend_square = (LATERAL_SHARE * limits.driving.lateral_mps2 / curvature_per_m.max(1e-6)) as f32;
                 if curvature_per_m > limits.front_curvature_per_m {
                     self.narrow_m = station_m;
+                    // It is led there at SUMO's speed: to brake would only make it late.
+                    bend_square = f32::INFINITY;
                 }
+                is_narrow = curvature_per_m > FAR_TOO_NARROW * limits.front_curvature_per_m;
             }
         }
         self.newest = (self.newest + 1) % self.points.len();
@@ -226,20 +274,54 @@ impl PacedPath {
             bend_square,
             deviation_m: deviation_m as f32,
             lamps: mean.signals,
+            is_narrow,
         };
+    }
+
+    /// Moves the mirror's place out of a bend: by as much as the mean cuts the corner, and so far that the body is nearer to SUMO's. SUMO's
+    /// bodies have both bumpers on the lane, where the rear of one that rolls cuts the corner.
+    fn move_outside(&mut self, swing_m2: f64) {
+        let [before_rad, after_rad] = [-BEND_REACH_M, BEND_REACH_M].map(|away_m| self.yaw_at(self.station_m + away_m));
+        let turn_rad = wrap_angle(after_rad - before_rad);
+        self.outside_m = 0.0;
+        if turn_rad.abs() < STRAIGHT_RAD {
+            return;
+        }
+        let curvature_per_m = turn_rad / (2.0 * BEND_REACH_M);
+        let frame_m = self.behind(self.ahead).station_m - self.behind(self.ahead + 1).station_m;
+        let outside_m = curvature_per_m * (swing_m2 + self.cut_frames2 * frame_m * frame_m);
+        let outside_m = outside_m.clamp(-MOST_OUTSIDE_M, MOST_OUTSIDE_M);
+        // SUMO's heading is that of the lane under the middle of the body; the front bumper is ahead of it.
+        let (sin, cos) = libm::sincos(after_rad);
+        self.now.front_x_m += outside_m * sin;
+        self.now.front_y_m -= outside_m * cos;
+        self.outside_m = outside_m.abs();
+    }
+
+    /// The mean of SUMO's headings at a station near the mirror, radians.
+    fn yaw_at(&self, station_m: f64) -> f64 {
+        let frames = self.first_ahead_of(station_m);
+        let (to, from) = (self.behind(frames), self.behind(frames + 1));
+        let turn_rad = wrap_angle(f64::from(to.yaw_rad) - f64::from(from.yaw_rad));
+        f64::from(from.yaw_rad) + share_of_way(from, to, station_m) * turn_rad
     }
 
     /// Finds the first point ahead of the mirror, near the one of the frame before.
     fn find_ahead(&mut self) {
+        self.ahead = self.first_ahead_of(self.station_m);
+    }
+
+    /// Frames by which the first point ahead of a station is behind the newest. The search begins at the mirror's.
+    fn first_ahead_of(&self, station_m: f64) -> usize {
         let last = self.points.len() - 2;
         let mut frames = self.ahead.min(last);
-        while frames < last && self.behind(frames + 1).station_m > self.station_m {
+        while frames < last && self.behind(frames + 1).station_m > station_m {
             frames += 1;
         }
-        while frames > 0 && self.behind(frames).station_m < self.station_m {
+        while frames > 0 && self.behind(frames).station_m < station_m {
             frames -= 1;
         }
-        self.ahead = frames;
+        frames
     }
 
     /// The speed from which the mirror can brake to what every bend ahead allows, m/s.
@@ -259,11 +341,7 @@ impl PacedPath {
     /// The state at the mirror's place; what does not move is that of `newest`.
     fn state(&self, newest: &TrafficState) -> TrafficState {
         let (to, from) = (self.behind(self.ahead), self.behind(self.ahead + 1));
-        let way_m = to.station_m - from.station_m;
-        let share = match way_m > 0.0 {
-            true => ((self.station_m - from.station_m) / way_m).clamp(0.0, 1.0),
-            false => 1.0,
-        };
+        let share = share_of_way(from, to, self.station_m);
         let mix = |axis: usize| from.position_m[axis] + share * (to.position_m[axis] - from.position_m[axis]);
         let turn_rad = wrap_angle(f64::from(to.yaw_rad) - f64::from(from.yaw_rad));
         TrafficState {
@@ -279,12 +357,25 @@ impl PacedPath {
     }
 }
 
+/// Share of the way between two points at which a station lies, 0 … 1.
+fn share_of_way(from: &PathPoint, to: &PathPoint, station_m: f64) -> f64 {
+    let way_m = to.station_m - from.station_m;
+    match way_m > 0.0 {
+        true => ((station_m - from.station_m) / way_m).clamp(0.0, 1.0),
+        false => 1.0,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     const FRAME_S: f64 = 0.1;
     const LATE: usize = 5;
+    const FRAMES: PreviewFrames = PreviewFrames {
+        window_states: 1,
+        late: LATE,
+    };
     const DRIVING: DrivingLimits = DrivingLimits {
         lateral_mps2: 6.0,
         curvature_per_m: 1.0,
@@ -297,6 +388,7 @@ mod tests {
     const LIMITS: PathLimits = PathLimits {
         driving: DRIVING,
         front_curvature_per_m: 1.0,
+        swing_m2: 0.0,
     };
 
     /// Means of a vehicle at `speed_mps` that drives 40 m straight, a quarter of a circle, and straight on.
@@ -318,7 +410,7 @@ mod tests {
 
     /// The mirror's states along the means.
     fn paced(means: impl Iterator<Item = TrafficState>, limits: Option<&PathLimits>) -> Vec<TrafficState> {
-        let mut path = PacedPath::new(LATE);
+        let mut path = PacedPath::new(FRAMES);
         let mut last: Option<TrafficState> = None;
         let states = means.map(|mean| {
             let step = last.replace(mean).map(|before| WindowStep {
@@ -426,7 +518,7 @@ mod tests {
 
     #[test]
     fn a_lane_change_moves_the_whole_path() {
-        let mut path = PacedPath::new(LATE);
+        let mut path = PacedPath::new(FRAMES);
         let at = |x_m: f64, y_m: f64| TrafficState {
             front_x_m: x_m,
             front_y_m: y_m,

@@ -14,7 +14,7 @@ use super::{
 pub struct PathAhead {
     window: StateWindow,
     path: PacedPath,
-    /// SUMO's own states since the path began, newest first, as far back as the mirror is behind.
+    /// SUMO's own states since the path began, newest first, as far back as a frame before the mirror's time.
     recent: VecDeque<TrafficState>,
     /// Frames by which the mirror is behind SUMO.
     delay: usize,
@@ -26,8 +26,8 @@ impl PathAhead {
     pub fn new(frames: PreviewFrames) -> Self {
         Self {
             window: StateWindow::new(frames.window_states),
-            path: PacedPath::new(frames.late),
-            recent: VecDeque::with_capacity(frames.delay() + 1),
+            path: PacedPath::new(frames),
+            recent: VecDeque::with_capacity(frames.delay() + 2),
             delay: frames.delay(),
         }
     }
@@ -50,7 +50,7 @@ impl PathAhead {
         frame_s: f64,
     ) -> Option<WindowStep> {
         let step = self.window.advance(now, length_m, frame_s)?;
-        if self.recent.len() == self.recent.capacity() {
+        if self.recent.len() == self.delay + 2 {
             self.recent.pop_back();
         }
         self.recent.push_front(*now);
@@ -63,9 +63,21 @@ impl PathAhead {
         self.delay
     }
 
-    /// SUMO's own states of the last frames, newest first.
-    pub fn recent(&self) -> impl Iterator<Item = &TrafficState> {
-        self.recent.iter()
+    /// SUMO's own states within a frame of the mirror's time, newest first; none if the path began later.
+    pub fn delayed(&self) -> impl Iterator<Item = &TrafficState> {
+        self.recent.iter().skip(self.delay.saturating_sub(1))
+    }
+
+    /// Distance along the path by which the mirror is later than it should be, metres.
+    #[must_use]
+    pub fn late_m(&self) -> f64 {
+        self.path.late_m()
+    }
+
+    /// True where the path begins to turn so narrowly that the vehicle has to be led.
+    #[must_use]
+    pub fn turns_narrowly(&self) -> bool {
+        self.path.turns_narrowly()
     }
 
     /// True near a turn of the path that is narrower than the vehicle's turning circle.

@@ -21,6 +21,8 @@ use crate::trig::wrap_angle;
 
 /// Shortest distance over which it is spread, metres.
 const LANE_CHANGE_M: f64 = 12.0;
+/// Time before a lane change that is known ahead, as a share of the time that it takes.
+const LANE_CHANGE_WAIT: f64 = 0.17;
 /// Sideways jump within one SUMO step that counts as a lane change, metres.
 const LANE_JUMP_M: f64 = 1.0;
 /// No vehicle changes lanes by more than this in one step, metres.
@@ -35,14 +37,14 @@ const UNEXPLAINED_M: f64 = 2.0;
 struct LaneChange {
     /// Offset to the left of SUMO's path at the start, metres; zero if there is none.
     offset_m: f64,
-    /// Share done, 0 … 1.
+    /// Share done, 0 … 1; below 0 it has yet to begin.
     phase: f64,
 }
 
 impl LaneChange {
     /// Remaining offset (metres) and its derivative by the phase.
     fn remaining(&self) -> [f64; 2] {
-        let s = self.phase;
+        let s = self.phase.max(0.0);
         let profile = s * s * s * (10.0 - s * (15.0 - 6.0 * s));
         let slope = 30.0 * s * s * (1.0 - s) * (1.0 - s);
         [self.offset_m * (1.0 - profile), -self.offset_m * slope]
@@ -131,11 +133,18 @@ impl ReferencePath {
     }
 
     /// Begins to return a lane change to the left, which the path has made at once.
-    pub(super) fn change_lane(&mut self, left_m: f64) {
+    fn change_lane(&mut self, left_m: f64) {
         self.lane_change = LaneChange {
             offset_m: self.lane_change.remaining()[0] - left_m,
             phase: 0.0,
         };
+    }
+
+    /// The same for a path that is ahead of its road user: it waits a little, because SUMO changes lanes right behind a faster vehicle,
+    /// which has not passed here yet.
+    pub(super) fn change_lane_ahead(&mut self, left_m: f64) {
+        self.change_lane(left_m);
+        self.lane_change.phase = -LANE_CHANGE_WAIT;
     }
 
     /// Continues as in the last step: what a road user does until it is set elsewhere.

@@ -9,7 +9,8 @@ use ipc_schema::{
 use super::{
     batch::{BatchModel, VehicleBatch, path_limits},
     curve::ReferenceCurve,
-    guidance,
+    departure::Departure,
+    guidance::{self, NarrowTurn},
     hero::Hero,
     pace::PathLimits,
     person::Person,
@@ -83,8 +84,8 @@ pub struct RoadUser {
     now: TrafficState,
     /// Distance of the path that it follows from SUMO's own, metres.
     deviation_m: f32,
-    /// That path is narrower here than its turning circle.
-    is_narrow: bool,
+    /// Whether that path is narrower here than its turning circle.
+    narrow: NarrowTurn,
     /// It is led along its path.
     guided: Option<GuidedVehicle>,
     /// Number of the last frame that had it; 0 = none yet.
@@ -129,7 +130,7 @@ impl RoadUser {
             before: TrafficState::default(),
             now: TrafficState::default(),
             deviation_m: 0.0,
-            is_narrow: false,
+            narrow: NarrowTurn::None,
             guided: None,
             seen_frame: 0,
             hidden: 0,
@@ -175,7 +176,7 @@ impl RoadUser {
             (Mover::Vehicle { path, .. }, Arrival::Jumping(_)) => path.coast(&self.before, settings.step_s()),
             (Mover::Vehicle { path, .. }, Arrival::Continuing) => {
                 if let Some(left_m) = lane_change_m {
-                    path.change_lane(left_m);
+                    path.change_lane_ahead(left_m);
                 }
                 if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s())
                     == PathJoin::Broken
@@ -220,11 +221,30 @@ impl RoadUser {
         }
         (self.before, self.now) = (step.before, step.now);
         self.deviation_m = path.deviation_m() as f32;
-        self.is_narrow = path.is_narrow();
+        self.narrow = match (path.is_narrow(), path.turns_narrowly()) {
+            (false, _) => NarrowTurn::None,
+            (true, false) => NarrowTurn::Near,
+            (true, true) => NarrowTurn::Begins,
+        };
         step.lane_change_m
     }
 
-    /// The boxes in which SUMO has it in the frames that the mirror moves through, newest first.
+    /// By how much the mirror that `out` describes is not where SUMO has it.
+    #[must_use]
+    pub fn departure(&self, ahead: Option<&PathAhead>, out: &VehicleState) -> Departure {
+        let Mover::Vehicle { path, .. } = &self.mover else {
+            return Departure::default();
+        };
+        Departure {
+            is_led: out.flags & GUIDED != 0,
+            lane_change_m: path.lane_change_m(),
+            late_m: ahead.map_or(0.0, PathAhead::late_m),
+            path_m: f64::from(self.deviation_m) + path.undriven_m(),
+            tracking_m: libm::hypot(out.tracking_lateral_m.into(), out.tracking_longitudinal_m.into()),
+        }
+    }
+
+    /// The boxes in which SUMO has it at the mirror's time, a frame more or less, newest first.
     pub fn sumo_boxes(&self, ahead: Option<&PathAhead>) -> Vec<OrientedBox> {
         let VehicleDimensions {
             length_m,
@@ -245,7 +265,7 @@ impl RoadUser {
             }
         };
         match ahead {
-            Some(path) => path.recent().map(solid).collect(),
+            Some(path) => path.delayed().map(solid).collect(),
             None => [self.now, self.before].iter().map(solid).collect(),
         }
     }
@@ -304,7 +324,10 @@ impl RoadUser {
                 settings.tick_s,
                 state.speed_mps,
                 spread_s,
-                &params.driving_limits(),
+                &match settings.vehicle.preview_s > 0.0 {
+                    true => params.preview_limits(),
+                    false => params.driving_limits(),
+                },
             );
             let rise = path.road(start_s).1;
             batch.load(member, params, state, (&curve, &rise), self.dimensions.front_m());
@@ -344,7 +367,7 @@ impl RoadUser {
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let away_m = [square.sqrt(), path.undriven_m()];
         let guided = match settings.vehicle.preview_s > 0.0 {
-            true => guidance::cause(state, away_m, path.lane_change_m(), self.is_narrow),
+            true => guidance::cause(state, away_m, path.lane_change_m(), self.narrow),
             false => None,
         };
         if guided.is_some() {
@@ -374,9 +397,9 @@ impl RoadUser {
         } else {
             None
         };
-        let lost = lost.map(|cause| match self.is_narrow {
-            true => ResynchronisationCause::NarrowTurn,
-            false => cause,
+        let lost = lost.map(|cause| match self.narrow {
+            NarrowTurn::None => cause,
+            NarrowTurn::Near | NarrowTurn::Begins => ResynchronisationCause::NarrowTurn,
         });
         let mut jump_m = 0.0;
         if lost.is_some() {
@@ -458,7 +481,7 @@ impl RoadUser {
                 }
                 out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32 + self.deviation_m;
                 let away_m = path.undriven_m() + path.lane_change_m();
-                if guidance::ends(state, away_m, self.is_narrow, &path_limits(built)) {
+                if guidance::ends(state, away_m, self.narrow != NarrowTurn::None, &path_limits(built)) {
                     self.guided = None;
                 }
             }

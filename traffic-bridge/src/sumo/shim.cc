@@ -304,7 +304,11 @@ void EngineSimulation::read_vehicle(const std::string& id, RawState& state) cons
         return;
     }
     if (has_elevation_) {
-        state.slope = engine::Vehicle::getSlope(id);
+        // A hero beside the road is on no lane, and has no slope for SUMO: it keeps its last.
+        const double slope = engine::Vehicle::getSlope(id);
+        if (slope != libsumo::INVALID_DOUBLE_VALUE) {
+            state.slope = slope;
+        }
     }
     if (!lane_places_.empty()) {
         const auto lane = lane_places_.find(engine::Vehicle::getLaneID(id));
