@@ -12,7 +12,8 @@ use serde::Deserialize;
 use super::{
     BenchOptions, BenchReport, MedianSpread, ReportTable,
     report::from_program,
-    sides::{BenchDirectory, ComparedScenario, compare_results},
+    sides::{BenchDirectory, ComparedScenario, OurRun, compare_results},
+    stages::StageTimes,
 };
 
 /// The sizes of a measurement.
@@ -87,6 +88,8 @@ enum PeerAnswer {
         version: String,
         /// Case → steps of a vehicle in a wall second.
         rates: BTreeMap<String, f64>,
+        /// Case → processor time of a step of a vehicle, microseconds, of all processes of the peer.
+        cpu_us: BTreeMap<String, f64>,
     },
     /// The peer is not installed.
     Missing { missing: String },
@@ -97,6 +100,8 @@ enum PeerAnswer {
 struct PeerRounds {
     /// Case → rates, one for each round.
     rates: BTreeMap<String, Vec<f64>>,
+    /// Case → processor time of a step of a vehicle, microseconds, one for each round.
+    cpu_us: BTreeMap<String, Vec<f64>>,
     /// Peer → the reason why it was not measured.
     missing: BTreeMap<String, String>,
     /// Peer → version.
@@ -106,8 +111,11 @@ struct PeerRounds {
 impl PeerRounds {
     fn add(&mut self, peer: &str, answer: PeerAnswer, install_by: &str) {
         match answer {
-            PeerAnswer::Rates { version, rates } => {
+            PeerAnswer::Rates { version, rates, cpu_us } => {
                 self.versions.insert(peer.into(), version);
+                for (case, each_us) in cpu_us {
+                    self.cpu_us.entry(case).or_default().push(each_us);
+                }
                 for (case, rate) in rates {
                     self.rates.entry(case).or_default().push(rate);
                 }
@@ -125,8 +133,12 @@ impl PeerRounds {
 struct PeersFigures {
     /// Ours on the large city: sensed vehicle-steps per wall second.
     many: Vec<f64>,
-    /// The same on the small city.
+    /// Processor time of one of these steps in the loop, all processes, microseconds.
+    many_cpu_us: Vec<f64>,
+    /// As `many`, on the small city.
     few: Vec<f64>,
+    /// As `many_cpu_us`, on the small city.
+    few_cpu_us: Vec<f64>,
     loops: PeerRounds,
     driving: PeerRounds,
 }
@@ -157,14 +169,23 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             compare_results(&theirs, &ours.results)?;
         }
         measured.many.push(ours.number("/env_steps_per_s")?);
+        measured.many_cpu_us.push(cpu_us(&ours)?);
         for peer in &DRIVING {
             let answer = run_driving(options, &place, peer, &few_net, size.driving_s)?;
             let install_by = format!("peers-{}", peer.peer);
             measured.driving.add(peer.name, answer, &install_by);
         }
-        measured.few.push(few.ours()?.number("/env_steps_per_s")?);
+        let ours = few.ours()?;
+        measured.few.push(ours.number("/env_steps_per_s")?);
+        measured.few_cpu_us.push(cpu_us(&ours)?);
     }
     report(size, &measured)
+}
+
+/// Processor time of a sensed vehicle-step in the loops of all processes, microseconds.
+fn cpu_us(ours: &OurRun) -> Result<f64, Exit> {
+    let stages = StageTimes::of(ours)?;
+    Ok(stages.per_step_us(stages.sum_s()))
 }
 
 /// Generates a city for both sides; returns it with its net.
@@ -245,7 +266,10 @@ fn report(size: &PeersSize, measured: &PeersFigures) -> Result<BenchReport, Exit
         "Beside Python loops over SUMO, MetaDrive and SMARTS",
         format!(
             "Vehicle-steps per wall second without loading; only the import of torch in our consumer counts, against ours. caraware (ours) and the \
-             peers are measured in turn; figures are medians of {rounds} rounds, and a ratio compares rates of one round (smallest–largest). Ours \
+             peers are measured in turn; figures are medians of {rounds} rounds, and a ratio compares one round (smallest–largest). Ours runs as several \
+             processes on all cores. A loop over libsumo and each driving environment are one Python process, a loop over TraCI is two processes \
+             that wait for each other. So the processor time of a vehicle-step stands beside the rate: it is that of all processes of a side in \
+             their loops, and does not count cores. SUMO and the peers use the allocator of the system, `traffic-bridge` uses mimalloc. Ours \
              reads every vehicle's state each 0.1 s, moves every vehicle at 100 Hz, samples its GNSS, IMU, speed and steering, and delivers them to \
              a torch tensor in the consumer's process. The Python loops run the same generated city of {vehicles} vehicles at steps of 0.1 s, with \
              SUMO's own time included. For every vehicle they call the getters that `traffic-bridge` calls at every step (position, angle, speed, \
@@ -267,7 +291,14 @@ fn report(size: &PeersSize, measured: &PeersFigures) -> Result<BenchReport, Exit
 fn loops_table(measured: &PeersFigures, report: &mut BenchReport) -> Result<ReportTable, Exit> {
     let mut table = ReportTable::new(
         "Python loops that read every vehicle of SUMO",
-        &["how", "vehicle-updates/s", "ours is faster by", "smallest–largest"],
+        &[
+            "how",
+            "vehicle-updates/s",
+            "ours is faster by",
+            "smallest–largest",
+            "CPU µs per vehicle-update",
+            "ours takes of it",
+        ],
     );
     let ours = MedianSpread::of(measured.many.iter().copied())?;
     report.figure("ours, vehicle-steps/s", ours.median);
@@ -276,21 +307,26 @@ fn loops_table(measured: &PeersFigures, report: &mut BenchReport) -> Result<Repo
         format!("{:.0}", ours.median),
         String::new(),
         String::new(),
+        format!("{:.2}", MedianSpread::of(measured.many_cpu_us.iter().copied())?.median),
+        String::new(),
     ]);
     for (case, theirs) in &measured.loops.rates {
         let rate = MedianSpread::of(theirs.iter().copied())?;
         let ratio = ratio(&measured.many, theirs)?;
         report.figure(format!("{case}, vehicle-updates/s"), rate.median);
         report.figure(format!("ratio to {case}"), ratio.median);
+        let [cpu, share] = cpu_cells(&measured.many_cpu_us, &measured.loops, case, report)?;
         table.row([
             case.clone(),
             format!("{:.0}", rate.median),
             format!("{:.2} ×", ratio.median),
             format!("{:.2}–{:.2}", ratio.smallest, ratio.largest),
+            cpu,
+            share,
         ]);
     }
     for (peer, why) in &measured.loops.missing {
-        table.row([peer.clone(), why.clone(), String::new(), String::new()]);
+        table.push(missing_row(peer, why, table.columns.len()));
     }
     Ok(table)
 }
@@ -300,16 +336,29 @@ fn driving_table(size: &PeersSize, measured: &PeersFigures, report: &mut BenchRe
         format!("ours, {} vehicles, is faster by", size.vehicles),
         format!("ours, {FEW} vehicles, is faster by"),
     );
+    let share_of_few = format!("ours, {FEW} vehicles, takes of it");
     let mut table = ReportTable::new(
         "Driving environments",
-        &["environment", "agent-steps/s", &of_many, &of_few],
+        &[
+            "environment",
+            "agent-steps/s",
+            &of_many,
+            &of_few,
+            "CPU µs per agent-step",
+            &share_of_few,
+        ],
     );
-    for (vehicles, rates) in [(size.vehicles, &measured.many), (FEW, &measured.few)] {
-        let rate = MedianSpread::of(rates.iter().copied())?;
+    let ours = [
+        (size.vehicles, &measured.many, &measured.many_cpu_us),
+        (FEW, &measured.few, &measured.few_cpu_us),
+    ];
+    for (vehicles, rates, cpu_us) in ours {
         table.row([
             format!("ours, {vehicles} vehicles"),
-            format!("{:.0}", rate.median),
+            format!("{:.0}", MedianSpread::of(rates.iter().copied())?.median),
             String::new(),
+            String::new(),
+            format!("{:.2}", MedianSpread::of(cpu_us.iter().copied())?.median),
             String::new(),
         ]);
     }
@@ -319,20 +368,39 @@ fn driving_table(size: &PeersSize, measured: &PeersFigures, report: &mut BenchRe
         report.figure(format!("{case}, agent-steps/s"), rate.median);
         report.figure(format!("ratio to {case}"), many.median);
         report.figure(format!("ratio of ours with {FEW} vehicles to {case}"), few.median);
+        let [cpu, share] = cpu_cells(&measured.few_cpu_us, &measured.driving, case, report)?;
         table.row([
             case.clone(),
             format!("{:.0}", rate.median),
             format!("{many:.0} ×"),
             format!("{few:.0} ×"),
+            cpu,
+            share,
         ]);
     }
     for (peer, why) in &measured.driving.missing {
-        table.row([peer.clone(), why.clone(), String::new(), String::new()]);
+        table.push(missing_row(peer, why, table.columns.len()));
     }
     Ok(table)
 }
 
-/// Ratio of our rate to theirs, round by round.
+/// A peer's processor time of a vehicle-step, and ours as a share of it, round by round.
+fn cpu_cells(ours: &[f64], theirs: &PeerRounds, case: &str, report: &mut BenchReport) -> Result<[String; 2], Exit> {
+    let theirs = theirs.cpu_us.get(case).map(Vec::as_slice).unwrap_or_default();
+    let (each, share) = (MedianSpread::of(theirs.iter().copied())?, ratio(ours, theirs)?);
+    report.figure(format!("{case}, CPU µs per vehicle-step"), each.median);
+    report.figure(format!("CPU of ours as a share of {case}"), share.median);
+    Ok([format!("{:.2}", each.median), format!("{share:.3} ×")])
+}
+
+/// The row of a peer that was not measured.
+fn missing_row(peer: &str, why: &str, columns: usize) -> Vec<String> {
+    let mut cells = vec![peer.to_owned(), why.to_owned()];
+    cells.resize(columns, String::new());
+    cells
+}
+
+/// Ratio of our figure to theirs, round by round.
 fn ratio(ours: &[f64], theirs: &[f64]) -> Result<MedianSpread, Exit> {
     MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| ours / theirs))
 }
@@ -350,11 +418,15 @@ mod tests {
     fn a_peer_that_is_not_installed_has_a_row_with_the_reason() {
         let mut measured = PeersFigures {
             many: vec![200.0, 300.0],
+            many_cpu_us: vec![6.0, 9.0],
             few: vec![50.0, 50.0],
+            few_cpu_us: vec![4.0, 4.0],
             ..PeersFigures::default()
         };
         for rate in ["100", "100"] {
-            let fast = answer(&format!(r#"{{"version": "1", "rates": {{"libsumo loop": {rate}}}}}"#));
+            let fast = answer(&format!(
+                r#"{{"version": "1", "rates": {{"libsumo loop": {rate}}}, "cpu_us": {{"libsumo loop": 10}}}}"#
+            ));
             measured.loops.add("libsumo", fast, "peers");
             let absent = answer(r#"{"missing": "No module named 'smarts'"}"#);
             measured.driving.add("SMARTS", absent, "peers-smarts");
@@ -364,7 +436,17 @@ mod tests {
         let [loops, driving] = report.tables.as_slice() else {
             unreachable!("{report}")
         };
-        assert_eq!(loops.rows[1], ["libsumo loop", "100", "2.50 ×", "2.00–3.00"]);
+        assert_eq!(
+            loops.rows[1],
+            [
+                "libsumo loop",
+                "100",
+                "2.50 ×",
+                "2.00–3.00",
+                "10.00",
+                "0.750 (0.600–0.900) ×"
+            ]
+        );
         assert_eq!(
             driving.rows.last().unwrap()[..2],
             [

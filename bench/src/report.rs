@@ -264,6 +264,31 @@ impl MedianSpread {
     }
 }
 
+/// A 95 % interval of the median of the distribution that `values` come from, by their order alone: the largest rank from each end that
+/// holds it with at least that probability (W. Conover, Practical Nonparametric Statistics, section 3.2).
+///
+/// # Errors
+/// There are fewer than six values, of which even the smallest and the largest do not hold it that surely.
+pub fn median_interval(values: &[f64]) -> Result<[f64; 2], Exit> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let count = sorted.len();
+    // Probability that fewer than `rank` of `count` values lie below the median: the lower tail of a binomial distribution.
+    let mut term = 0.5_f64.powi(i32::try_from(count).unwrap_or(i32::MAX));
+    let (mut tail, mut rank) = (term, 0);
+    while rank < count / 2 && tail <= 0.025 {
+        rank += 1;
+        #[expect(clippy::cast_precision_loss, reason = "some dozens")]
+        let odds = (count + 1 - rank) as f64 / rank as f64;
+        term *= odds;
+        tail += term;
+    }
+    match rank {
+        0 => Err(Exit::run(format!("{count} values have no 95 % interval of their median"), "")),
+        _ => Ok([sorted[rank - 1], sorted[count - rank]]),
+    }
+}
+
 impl fmt::Display for MedianSpread {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let digits = f.precision().unwrap_or(2);
@@ -322,6 +347,16 @@ mod tests {
         assert_eq!([spread.median, spread.smallest, spread.largest], [2.5, 1.0, 4.0]);
         assert_eq!(MedianSpread::of([5.0]).unwrap().median, 5.0);
         assert!(MedianSpread::of([]).is_err());
+    }
+
+    #[test]
+    fn the_interval_of_a_median_has_the_ranks_of_the_binomial_distribution() {
+        let ranks = |count: u32| median_interval(&(1..=count).rev().map(f64::from).collect::<Vec<_>>()).ok();
+        // 1 − 2 P(B(n, ½) < rank): 96.9 % of 6, 96.1 % of 9, 97.2 % of 41.
+        let expected = [(5, None), (6, Some([1.0, 6.0])), (9, Some([2.0, 8.0])), (41, Some([14.0, 28.0]))];
+        for (count, interval) in expected {
+            assert_eq!(ranks(count), interval, "{count}");
+        }
     }
 
     #[test]

@@ -1,6 +1,8 @@
 """The measuring loops of `caraware bench peers`, with stand-ins for the peers."""
 
 import json
+import subprocess
+import sys
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -8,8 +10,9 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from caraware_bench import peer
-from caraware_bench.agent_steps import WARM_UP_STEPS, agent_steps_per_s
+from caraware_bench import agent_steps, peer
+from caraware_bench.agent_steps import WARM_UP_STEPS
+from caraware_bench.cost import LoopCost, cpu_s
 from caraware_bench.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure
 
 VEHICLES = 6
@@ -71,7 +74,7 @@ def test_signals_are_read_in_turn() -> None:
 
 def test_a_loop_that_fails_ends_sumo() -> None:
     sound, broken = FakeSumo(), FakeSumo()
-    assert measure(sound, ["sumo"], steps=2) > 0
+    assert measure(sound, ["sumo"], steps=2).steps == 2 * VEHICLES
     broken.vehicle.getAngle = None
     with pytest.raises(TypeError):
         measure(broken, ["sumo"], steps=2)
@@ -102,17 +105,33 @@ def test_agent_steps_are_counted_while_stepping_only(monkeypatch: pytest.MonkeyP
             self.closed = True
 
     world = World()
-    assert agent_steps_per_s(world, 3.0) == 14.0
+    cost = agent_steps.measure(world, 3.0)
+    assert (cost.steps, cost.rate) == (6 * 7, 14.0)
     assert world.closed and world.steps == WARM_UP_STEPS + 6
 
 
 def test_a_peer_that_is_not_installed_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(options: object) -> tuple[str, dict[str, float]]:
+    def absent(options: object) -> tuple[str, dict[str, LoopCost]]:
         raise ImportError("No module named 'smarts'")
 
     monkeypatch.setitem(peer.PEERS, "smarts", absent)
     peer.main(["smarts", "--json", str(tmp_path / "out.json")])
     assert json.loads((tmp_path / "out.json").read_text()) == {"missing": "No module named 'smarts'"}
-    monkeypatch.setitem(peer.PEERS, "smarts", lambda options: ("2", {"a": 1.5}))
+    monkeypatch.setitem(peer.PEERS, "smarts", lambda options: ("2", {"a": LoopCost(6, 4.0, 3.0)}))
     peer.main(["smarts", "--json", str(tmp_path / "out.json")])
-    assert json.loads((tmp_path / "out.json").read_text()) == {"version": "2", "rates": {"a": 1.5}}
+    assert json.loads((tmp_path / "out.json").read_text()) == {
+        "version": "2",
+        "rates": {"a": 1.5},
+        "cpu_us": {"a": 5e5},
+    }
+
+
+def test_processor_time_counts_the_processes_that_were_started() -> None:
+    before_s = cpu_s()
+    work = "print(sum(range(20_000_000)), flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", work], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        used_s = cpu_s() - before_s
+        child.communicate(b"\n")
+    assert used_s > 0.1

@@ -3,6 +3,8 @@
 import time
 from typing import Protocol
 
+from caraware_bench.cost import LoopCost, cpu_s
+
 WARM_UP_STEPS = 10
 
 
@@ -19,18 +21,19 @@ class World(Protocol):
         """End the environment."""
 
 
-def agent_steps_per_s(world: World, seconds: float) -> float:
-    """Agent-steps per wall second over at least `seconds` of stepping, without resets and the first steps."""
+def measure(world: World, seconds: float) -> LoopCost:
+    """The cost of at least `seconds` of stepping, without resets and the first steps."""
     try:
         for _ in range(WARM_UP_STEPS):
             world.ready()
             world.step()
-        taken_s, agent_steps = 0.0, 0
-        while taken_s < seconds:
+        wall_s, used_s, agent_steps = 0.0, 0.0, 0
+        while wall_s < seconds:
             world.ready()
-            begin = time.perf_counter()
+            cpu_before_s, begin = cpu_s(), time.perf_counter()
             agent_steps += world.step()
-            taken_s += time.perf_counter() - begin
-        return agent_steps / taken_s
+            wall_s += time.perf_counter() - begin
+            used_s += cpu_s() - cpu_before_s
+        return LoopCost(agent_steps, wall_s, used_s)
     finally:
         world.close()

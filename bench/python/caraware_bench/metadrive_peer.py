@@ -7,7 +7,8 @@ import metadrive
 from metadrive.constants import VERSION as VERSION
 from metadrive.envs.marl_envs import MultiAgentRoundaboutEnv
 
-from caraware_bench.agent_steps import agent_steps_per_s
+from caraware_bench.agent_steps import measure
+from caraware_bench.cost import LoopCost
 
 AGENTS = 40
 ACTION = [0.0, 0.1]
@@ -44,8 +45,8 @@ class Roundabout:
         self._env.close()
 
 
-def rates(seconds: float) -> dict[str, float]:
-    """Agent-steps per second with the default observation, and without its rays."""
+def costs(seconds: float) -> dict[str, LoopCost]:
+    """The cost of agent-steps with the default observation, and without its rays."""
     if not (Path(metadrive.__file__).parent / "assets" / "version.txt").exists():
         # MetaDrive would try to download them.
         raise ImportError("MetaDrive's assets are not installed")
@@ -53,4 +54,4 @@ def rates(seconds: float) -> dict[str, float]:
         "MetaDrive, roundabout, 40 agents, LIDAR of 72 rays": {},
         "MetaDrive, roundabout, 40 agents, own state only": dict(BLIND),
     }
-    return {name: agent_steps_per_s(Roundabout(vehicle), seconds) for name, vehicle in cases.items()}
+    return {name: measure(Roundabout(vehicle), seconds) for name, vehicle in cases.items()}

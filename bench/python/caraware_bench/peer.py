@@ -1,8 +1,8 @@
 """Measures one peer of `caraware bench peers`: `python -m caraware_bench.peer NAME … --json FILE`.
 
 It runs in the virtual environment in which the peer is installed, and needs only this package of the project. It writes
-`{"version": …, "rates": {case: rate}}`, vehicle-updates or agent-steps per wall second, or `{"missing": reason}` if the
-peer is not installed.
+`{"version": …, "rates": {case: rate}, "cpu_us": {case: µs}}`, vehicle-updates or agent-steps per wall second and the
+processor time of each, or `{"missing": reason}` if the peer is not installed.
 """
 
 import argparse
@@ -11,11 +11,13 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-Rates = dict[str, float]
-"""Case → updates per wall second."""
+from caraware_bench.cost import LoopCost
+
+Costs = dict[str, LoopCost]
+"""By case."""
 
 
-def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
+def libsumo(options: argparse.Namespace) -> tuple[str, Costs]:
     """Measure a Python loop over libsumo, with SUMO in the same process."""
     import libsumo
 
@@ -24,7 +26,7 @@ def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
     return version("libsumo"), {"libsumo, Python loop": measure(libsumo, arguments(options), options.steps)}
 
 
-def traci(options: argparse.Namespace) -> tuple[str, Rates]:
+def traci(options: argparse.Namespace) -> tuple[str, Costs]:
     """Measure a Python loop over TraCI, with SUMO at the other end of a socket."""
     import traci
 
@@ -38,21 +40,21 @@ def arguments(options: argparse.Namespace) -> list[str]:
     return [options.sumo, "-c", options.sumocfg, "--output-prefix", options.prefix, "--no-step-log", "true"]
 
 
-def metadrive(options: argparse.Namespace) -> tuple[str, Rates]:
+def metadrive(options: argparse.Namespace) -> tuple[str, Costs]:
     """Measure MetaDrive's multi-agent roundabout."""
-    from caraware_bench.metadrive_peer import VERSION, rates
+    from caraware_bench.metadrive_peer import VERSION, costs
 
-    return VERSION, rates(options.seconds)
+    return VERSION, costs(options.seconds)
 
 
-def smarts(options: argparse.Namespace) -> tuple[str, Rates]:
+def smarts(options: argparse.Namespace) -> tuple[str, Costs]:
     """Measure SMARTS's HiWayEnv on a SUMO net."""
-    from caraware_bench.smarts_peer import VERSION, rates
+    from caraware_bench.smarts_peer import VERSION, costs
 
-    return VERSION, rates(options.net, options.seconds)
+    return VERSION, costs(options.net, options.seconds)
 
 
-PEERS: dict[str, Callable[[argparse.Namespace], tuple[str, Rates]]] = {
+PEERS: dict[str, Callable[[argparse.Namespace], tuple[str, Costs]]] = {
     "libsumo": libsumo,
     "traci": traci,
     "metadrive": metadrive,
@@ -61,7 +63,7 @@ PEERS: dict[str, Callable[[argparse.Namespace], tuple[str, Rates]]] = {
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure one peer and write its rates."""
+    """Measure one peer and write what it costs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("peer", choices=PEERS)
     parser.add_argument("--sumo", help="the program `sumo`")
@@ -70,11 +72,15 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, help="SUMO steps of a loop")
     parser.add_argument("--net", type=Path, help="SUMO net that the agents drive on, if the peer has no map of its own")
     parser.add_argument("--seconds", type=float, default=10.0, help="wall time of each case of a driving environment")
-    parser.add_argument("--json", type=Path, required=True, help="where to write the rates")
+    parser.add_argument("--json", type=Path, required=True, help="where to write the costs")
     options = parser.parse_args(argv)
     try:
-        release, rates = PEERS[options.peer](options)
-        measured: dict[str, object] = {"version": release, "rates": rates}
+        release, costs = PEERS[options.peer](options)
+        measured: dict[str, object] = {
+            "version": release,
+            "rates": {case: cost.rate for case, cost in costs.items()},
+            "cpu_us": {case: cost.cpu_us for case, cost in costs.items()},
+        }
     except ImportError as reason:
         measured = {"missing": str(reason)}
     options.json.write_text(json.dumps(measured))

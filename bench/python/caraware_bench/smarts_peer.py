@@ -12,7 +12,8 @@ from smarts.env.gymnasium.hiway_env_v1 import HiWayEnvV1
 from smarts.sstudio import gen_scenario
 from smarts.sstudio.sstypes import EndlessMission, Scenario
 
-from caraware_bench.agent_steps import agent_steps_per_s
+from caraware_bench.agent_steps import measure
+from caraware_bench.cost import LoopCost
 
 VERSION = version("smarts")
 AGENTS = [f"agent-{number}" for number in range(8)]
@@ -54,8 +55,8 @@ class HighWay:
         self._env.close()
 
 
-def rates(net: Path, seconds: float) -> dict[str, float]:
-    """Agent-steps per second with way points, as in SMARTS's examples, and with the agent's own state only."""
+def costs(net: Path, seconds: float) -> dict[str, LoopCost]:
+    """The cost of agent-steps with way points, as in SMARTS's examples, and with the agent's own state only."""
     cases = {
         "SMARTS, 8 agents, way points": AgentInterface.from_type(AgentType.Laner),
         "SMARTS, 8 agents, own state only": AgentInterface(action=ActionSpaceType.Lane),
@@ -65,4 +66,4 @@ def rates(net: Path, seconds: float) -> dict[str, float]:
         shutil.copy(net, scenario / "map.net.xml")
         missions = [EndlessMission(begin=(street, 0, 50.0)) for street in streets(net)]
         gen_scenario(Scenario(ego_missions=missions), output_dir=scenario)
-        return {name: agent_steps_per_s(HighWay(scenario, interface), seconds) for name, interface in cases.items()}
+        return {name: measure(HighWay(scenario, interface), seconds) for name, interface in cases.items()}

@@ -9,6 +9,8 @@ import time
 from dataclasses import dataclass, field
 from types import ModuleType
 
+from caraware_bench.cost import LoopCost, cpu_s
+
 SIGNAL_PERIOD_STEPS = 4
 """Each vehicle's signals are read once in this many steps."""
 
@@ -47,13 +49,14 @@ class Mirror:
                 self.signals[vehicle] = signals(vehicle)
 
 
-def measure(sumo: ModuleType, arguments: list[str], steps: int) -> float:
-    """Vehicle-updates per wall second over the first `steps` steps, with SUMO's own time and without loading."""
+def measure(sumo: ModuleType, arguments: list[str], steps: int) -> LoopCost:
+    """The cost of the first `steps` steps with SUMO's own time, its process's included, and without loading."""
     sumo.start(arguments)
     try:
         mirror = Mirror(sumo)
-        begin = time.perf_counter()
+        cpu_before_s, begin = cpu_s(), time.perf_counter()
         updates = sum(mirror.step() for _ in range(steps))
-        return updates / (time.perf_counter() - begin)
+        wall_s = time.perf_counter() - begin
+        return LoopCost(updates, wall_s, cpu_s() - cpu_before_s)
     finally:
         sumo.close()
