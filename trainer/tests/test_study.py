@@ -12,7 +12,8 @@ from caraware.study import reproduce
 from caraware.study.recording import ARRAYS, FOLDER, SCALARS, TENSORS, EpisodeWriter, Recording
 from caraware.study.regression import Comparison, converged, same_steps
 from caraware.study.reproduce import ExpectedFigure, FiguresError, compare, expected_figures
-from caraware.study.tables import TABLES, Table
+from caraware.study.sublane import TRIPS, write_sublane_scenario
+from caraware.study.tables import TABLES, Options, StudyError, Table, town, whole_run
 from synthetic_vehicle import VehicleObservation, observations, town_track, vehicle_run
 
 
@@ -138,3 +139,41 @@ def test_ppo_and_regression_learn_from_the_same_ticks_by_as_many_steps(tmp_path:
     assert (many.samples, many.gradient_steps) == (720, 30 * 23)
     assert many.mean_m < few.mean_m
     assert of.raw_gnss_m() == pytest.approx([7.0, 7.0], abs=1.0)
+
+
+def write_report(folder: Path, **entries: object) -> None:
+    folder.mkdir(parents=True)
+    errors_m = {f"{name}_mean_error_m": 1.0 for name in ("ppo", "supervised", "raw_gnss", "ekf", "map_ekf")}
+    (folder / "report.json").write_text(json.dumps({"result": "completed"} | errors_m | entries))
+
+
+def test_a_table_of_whole_runs_has_a_value_of_each_seed(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        write_report(tmp_path / f"town-{seed}", ppo_mean_error_m=4.0 + seed, supervised_mean_error_m=4.0)
+    measured = town(Options(tmp_path, (1, 2)))
+    assert (measured["policy"], measured["regression"]) == ([5.0, 6.0], [4.0, 4.0])
+    assert measured["policy_by_regression"] == [1.25, 1.5]
+    assert measured["map_ekf"] == [1.0, 1.0]
+
+
+def test_a_run_that_was_stopped_is_no_value(tmp_path: Path) -> None:
+    write_report(tmp_path / "town-1", result="interrupted")
+    with pytest.raises(StudyError, match="the run is interrupted; remove its directory"):
+        whole_run(Options(tmp_path, (1,)), "town-1", "town", ())
+
+
+def test_drivers_of_the_sublane_scenario_drift_in_their_lanes(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    net = tmp_path / "net.net.xml"
+    streets = "".join(f'<edge id="{way}{name}"><lane index="0"/></edge>' for name in "abc" for way in ("", "-"))
+    closed = '<edge id=":j" function="internal"><lane/></edge><edge id="walk"><lane allow="pedestrian"/></edge>'
+    net.write_text(f"<net>{streets}{closed}</net>")
+    types = root / "maps" / "town" / "town.vtypes.add.xml"
+    scenario = write_sublane_scenario(net, types, tmp_path / "scenario")
+    assert "<lateral-resolution" in scenario.read_text() and str(net) in scenario.read_text()
+    written = (scenario.parent / "types.add.xml").read_text()
+    assert written.count('lcSigma="0.5"') == 3 and 'id="pedestrian"' not in written
+    trips = (scenario.parent / "trips.rou.xml").read_text()
+    assert trips.count("<trip ") == TRIPS and '":j"' not in trips and '"walk"' not in trips
+    write_sublane_scenario(net, types, tmp_path / "again")
+    assert (tmp_path / "again" / "trips.rou.xml").read_text() == trips

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from caraware.report.statistics import mean_interval
-from caraware.study.tables import TABLES, Measured, Options
+from caraware.study.tables import TABLES, Measured, Options, StudyError
 
 FIGURES = Path(__file__).parents[4] / "docs" / "figures.toml"
 
@@ -73,8 +73,13 @@ def main(arguments: Sequence[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("table", choices=list(TABLES), metavar="TABLE", help="one of those below")
-    parser.add_argument("--runs", type=Path, default=Path("runs/reproduce"), help="directory of the recorded runs")
-    parser.add_argument("--seeds", type=int, default=5, help="learners, each with a seed of its own (default 5)")
+    parser.add_argument(
+        "--runs",
+        type=Path,
+        default=Path("runs/reproduce"),
+        help="directory of the runs; those there are kept",
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="whole runs, each with a seed of its own (default 5)")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="the file with the intervals")
     options = parser.parse_args(arguments)
     if options.seeds < 1:
@@ -84,7 +89,11 @@ def main(arguments: Sequence[str]) -> int:
     except FiguresError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    measured = TABLES[options.table].measure(Options(options.runs, range(1, options.seeds + 1)))
+    try:
+        measured = TABLES[options.table].measure(Options(options.runs, range(1, options.seeds + 1)))
+    except StudyError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     for name, values in measured.items():
         quoted = expected.get(name)
         interval = f"{quoted.low:g} … {quoted.high:g}" if quoted else "none"

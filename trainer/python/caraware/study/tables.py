@@ -1,33 +1,58 @@
 """The tables of the docs that `caraware reproduce` measures again: what each runs, from which seeds.
 
-A table records a run once (`caraware.study.recording`), then lets every estimator see the same bytes.
+Filters see the bytes of a recorded run (`caraware.study.recording`). What is learnt is measured by whole runs, each
+from a seed of its own: of traffic, of noise, of the networks, of the evaluations. What is timed runs `caraware bench`.
 """
 
 import json
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from caraware.run.program import caraware_program
 from caraware.study.cooperation import ESTIMATORS as COOPERATION_ESTIMATORS
 from caraware.study.cooperation import errors_by_episode
-from caraware.study.fusing import FusionComparison
+from caraware.study.filtering import FilterComparison
 from caraware.study.recording import FOLDER, Recording
-from caraware.study.regression import Comparison, same_steps
+from caraware.study.regression import Comparison
+from caraware.study.sublane import write_sublane_scenario
 
 Measured = dict[str, list[float]]
-"""Values of each figure (m), one for each independent seed: of an evaluation, or of a learner."""
+"""Values of each figure (m, or ratios), one for each independent seed: of an evaluation, or of a whole run."""
 
-FUSION_EVALUATIONS, TOWN_EVALUATIONS = 5, 4
+FUSION_EVALUATIONS = 5
 COOPERATION_EVALUATIONS = 5
 COOPERATION_SHARES = (0.1, 0.3, 0.5, 1.0)
 """Shares of the vehicles with a radio."""
 DEFAULT_NOISE = ("gnss.correlated_std_m=0.0", "blackout.enabled=false")
 SENSORS: Mapping[str, tuple[str, ...]] = {"default_noise": DEFAULT_NOISE, "faults": ()}
 """Settings beside the preset `fusion`, which has a slow error of fixes and blackouts."""
+ON_SUBLANES = (
+    "gnss.correlated_std_m=3.0",
+    "blackout.enabled=true",
+    "task.action=place",
+    "traffic.max_cavs=32",
+    "traffic.max_road_users=256",
+    "episode.ticks=1024",
+    "episode.training_episodes=16",
+    "episode.evaluation_ticks=300",
+    "episode.final_evaluations=5",
+    "trainer.module=caraware.fusion.train",
+    "trainer.learning_rate=2e-3",
+    "trainer.learning_rate_final=2e-4",
+    "trainer.hidden=[64]",
+    "trainer.supervised=false",
+    "trainer.epochs=4",
+)
+"""What the preset `fusion` sets, for a scenario."""
+ESTIMATORS = {"ppo": "policy", "supervised": "regression", "raw_gnss": "raw_gnss", "ekf": "ekf", "map_ekf": "map_ekf"}
+"""Names in `report.json`, and of figures."""
+
+
+class StudyError(Exception):
+    """A run that a table needs is there, but cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +60,9 @@ class Options:
     """What a table is measured with."""
 
     runs: Path
-    """Directory of the recorded runs; one that is there already is not made again."""
+    """Directory of the runs; one that is there already is not made again."""
     seeds: Sequence[int]
-    """Of learners."""
+    """Of whole runs."""
 
 
 @dataclass(frozen=True)
@@ -54,25 +79,68 @@ def filters(options: Options) -> Measured:
     measured: Measured = {}
     for label, settings in SENSORS.items():
         recording = recorded(options, "fusion", label, settings)
-        of = FusionComparison(recording, FUSION_EVALUATIONS)
+        of = FilterComparison(recording, FUSION_EVALUATIONS)
         measured |= {f"{label}.{name}": values for name, values in of.filters_m().items()}
         measured[f"{label}.raw_gnss"] = Comparison(recording, FUSION_EVALUATIONS).raw_gnss_m()
     return measured
 
 
+def town(options: Options) -> Measured:
+    """Policy, regression by as many samples and steps, and filters: whole runs of the preset `town`."""
+    reports = [whole_run(options, f"town-{seed}", "town", (f"run.seed={seed}",)) for seed in options.seeds]
+    measured = {name: [_error_m(report, key) for report in reports] for key, name in ESTIMATORS.items()}
+    pairs = zip(measured["policy"], measured["regression"], strict=True)
+    return measured | {"policy_by_regression": [policy / regression for policy, regression in pairs]}
+
+
 def fusion(options: Options) -> Measured:
-    """The learned estimator, and its error as a share of the two filters': each learner's seed one value."""
-    of = FusionComparison(recorded(options, "fusion", "faults", SENSORS["faults"]), FUSION_EVALUATIONS)
-    filters_m = {name: float(np.mean(values)) for name, values in of.filters_m().items()}
-    means_m = [float(np.mean(of.errors_m(of.trained(seed)))) for seed in options.seeds]
-    shares = {f"fusion_by_{name}": [mean_m / filter_m for mean_m in means_m] for name, filter_m in filters_m.items()}
-    return {"fusion": means_m} | shares
+    """The learned estimator and the filter that it starts as: whole runs with each sensor setting, and on sublanes."""
+    measured: Measured = {}
+    for label, settings in SENSORS.items():
+        measured |= _learnt(label, (_fusion_run(options, label, "fusion", settings, seed) for seed in options.seeds))
+    # The net and the types of the scenario are those of a run that is there by now.
+    run = json.loads((options.runs / _name("faults", options.seeds[0]) / "run.json").read_text())
+    files = [Path(file) for file in run["scene_files"]["additional_files"]]
+    types = next(file for file in files if file.name.endswith(".vtypes.add.xml"))
+    scenario = write_sublane_scenario(Path(run["scene_files"]["net_file"]), types, options.runs / "sublane-scenario")
+    runs = (_fusion_run(options, "sublane", str(scenario), ON_SUBLANES, seed) for seed in options.seeds)
+    return measured | _learnt("sublane", runs)
 
 
-def regression(options: Options) -> Measured:
-    """Regression by PPO's samples and gradient steps: each learner's seed one value."""
-    of = Comparison(recorded(options, "town", "town", ()), TOWN_EVALUATIONS)
-    return {"regression": [each.mean_m for seed in options.seeds for each in same_steps(of, seed, ppo=False)]}
+def _learnt(label: str, reports: Iterable[Mapping[str, Any]]) -> Measured:
+    errors_m = [(_error_m(report, "ppo"), _error_m(report, "map_ekf")) for report in reports]
+    return {
+        f"{label}.fusion": [learnt for learnt, _ in errors_m],
+        f"{label}.map_ekf": [filtered for _, filtered in errors_m],
+        f"{label}.fusion_by_map_ekf": [learnt / filtered for learnt, filtered in errors_m],
+    }
+
+
+def _fusion_run(options: Options, label: str, config: str, settings: Sequence[str], seed: int) -> Mapping[str, Any]:
+    own = (f"run.seed={seed}", "episode.evaluation_interval=0")
+    return whole_run(options, _name(label, seed), config, (*settings, *own))
+
+
+def _name(label: str, seed: int) -> str:
+    return f"fusion-{label}-{seed}"
+
+
+def overhead(options: Options) -> Measured:
+    """Wall time of co-simulation by that of bare `sumo`, with either allocator: one run of the benchmark."""
+    return _of_benchmark(options, "overhead", ("ratio of wall times", "ratio of wall times, same allocator"))
+
+
+def peers(options: Options) -> Measured:
+    """Rate of sensed vehicle-steps by that of Python loops over SUMO: one run of the benchmark."""
+    return _of_benchmark(options, "peers", ("ratio to libsumo, Python loop", "ratio to TraCI, Python loop"))
+
+
+def _of_benchmark(options: Options, part: str, names: Sequence[str]) -> Measured:
+    file = options.runs / f"{part}.json"
+    options.runs.mkdir(parents=True, exist_ok=True)
+    subprocess.run([str(caraware_program()), "bench", part, "--json", str(file)], check=True)
+    figures = json.loads(file.read_text())["figures"]
+    return {name: [float(figures[name])] for name in names if name in figures}
 
 
 def cooperation(options: Options) -> Measured:
@@ -96,10 +164,27 @@ def cooperation(options: Options) -> Measured:
 
 TABLES: Mapping[str, Table] = {
     "filters": Table("docs/baselines.md", "the filters with and without a map", filters),
-    "regression": Table("docs/baselines.md", "regression with PPO's samples and gradient steps", regression),
     "cooperation": Table("docs/cooperation.md", "localisation with others' help", cooperation),
-    "fusion": Table("docs/fusion.md", "the learned estimator beside the filters", fusion),
+    "town": Table("docs/baselines.md", "policy and regression by as many samples and steps", town),
+    "fusion": Table("docs/fusion.md", "the learned estimator beside the filter that it starts as", fusion),
+    "overhead": Table("docs/benchmarks.md", "co-simulation beside bare `sumo`", overhead),
+    "peers": Table("docs/benchmarks.md", "rates beside Python loops over SUMO", peers),
 }
+
+
+def whole_run(options: Options, name: str, config: str, settings: Sequence[str]) -> Mapping[str, Any]:
+    """`report.json` of a completed run; made unless it is there. Raises `StudyError`, `CalledProcessError`."""
+    report = options.runs / name / "report.json"
+    if not report.exists():
+        _train(options, name, config, settings)
+    found: Mapping[str, Any] = json.loads(report.read_text())
+    if found["result"] != "completed":
+        raise StudyError(f"{report}: the run is {found['result']}; remove its directory, then start again")
+    return found
+
+
+def _error_m(report: Mapping[str, Any], estimator: str) -> float:
+    return float(report[f"{estimator}_mean_error_m"])
 
 
 def recorded(options: Options, preset: str, label: str, settings: Sequence[str]) -> Recording:
@@ -111,7 +196,10 @@ def recorded(options: Options, preset: str, label: str, settings: Sequence[str])
         list((recording.run_dir / FOLDER).glob("*.npz"))
     ):
         return recording
-    sets = ["trainer.module=caraware.study.recording", *settings]
-    command = [str(caraware_program()), "train", preset, "--runs", str(options.runs), "--name", name]
-    subprocess.run([*command, *(word for each in sets for word in ("--set", each))], check=True)
+    _train(options, name, preset, ("trainer.module=caraware.study.recording", *settings))
     return recording
+
+
+def _train(options: Options, name: str, config: str, settings: Sequence[str]) -> None:
+    command = [str(caraware_program()), "train", config, "--runs", str(options.runs), "--name", name]
+    subprocess.run([*command, *(word for each in settings for word in ("--set", each))], check=True)
