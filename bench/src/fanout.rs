@@ -254,10 +254,7 @@ impl FanoutBench {
                 format!("{ratio:.3}"),
             ]);
         }
-        let (spread, [low, high]) = (
-            MedianSpread::of(ratios.iter().copied())?,
-            median_interval(&ratios)?,
-        );
+        let (spread, [low, high]) = (MedianSpread::of(ratios.iter().copied())?, median_interval(&ratios)?);
         report.figure("rate watched / off, median", spread.median);
         report.figure("rate watched / off, smallest", spread.smallest);
         report.figure("rate watched / off, lower end of the median's 95 % interval", low);

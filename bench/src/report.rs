@@ -284,7 +284,10 @@ pub fn median_interval(values: &[f64]) -> Result<[f64; 2], Exit> {
         tail += term;
     }
     match rank {
-        0 => Err(Exit::run(format!("{count} values have no 95 % interval of their median"), "")),
+        0 => Err(Exit::run(
+            format!("{count} values have no 95 % interval of their median"),
+            "",
+        )),
         _ => Ok([sorted[rank - 1], sorted[count - rank]]),
     }
 }
@@ -353,7 +356,12 @@ mod tests {
     fn the_interval_of_a_median_has_the_ranks_of_the_binomial_distribution() {
         let ranks = |count: u32| median_interval(&(1..=count).rev().map(f64::from).collect::<Vec<_>>()).ok();
         // 1 − 2 P(B(n, ½) < rank): 96.9 % of 6, 96.1 % of 9, 97.2 % of 41.
-        let expected = [(5, None), (6, Some([1.0, 6.0])), (9, Some([2.0, 8.0])), (41, Some([14.0, 28.0]))];
+        let expected = [
+            (5, None),
+            (6, Some([1.0, 6.0])),
+            (9, Some([2.0, 8.0])),
+            (41, Some([14.0, 28.0])),
+        ];
         for (count, interval) in expected {
             assert_eq!(ranks(count), interval, "{count}");
         }

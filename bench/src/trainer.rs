@@ -12,27 +12,30 @@ const HORIZON: f64 = 32_768.0;
 /// Visits of a sample in an update, as in `caraware_bench.trainer`.
 const EPOCHS: f64 = 4.0;
 
-/// The output of `caraware_bench.trainer`: seconds, by round.
+/// The output of `caraware_bench.trainer`.
 #[derive(Debug, Deserialize)]
 struct TrainerFigures {
     threads: u32,
     precision: String,
-    update_s: UpdateTimes,
-    horizon_s: HorizonTimes,
+    updates: Vec<LearnerTimes>,
+    rollouts: Vec<RolloutTimes>,
     ticks: Vec<TickTimes>,
 }
 
+/// Seconds of one learner, by round.
 #[derive(Debug, Deserialize)]
-struct UpdateTimes {
-    ours: Vec<f64>,
-    plain: Vec<f64>,
-    sb3: Vec<f64>,
+struct LearnerTimes {
+    name: String,
+    wall_s: Vec<f64>,
+    cpu_s: Vec<f64>,
 }
 
+/// The same rollout on all sides.
 #[derive(Debug, Deserialize)]
-struct HorizonTimes {
-    ours: Vec<f64>,
-    sb3: Vec<f64>,
+struct RolloutTimes {
+    /// Ticks of eight vehicles, or as many sub-environments, in a forward pass.
+    window: u32,
+    learners: Vec<LearnerTimes>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -60,56 +63,73 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "The learner",
         format!(
             "The paper's networks (9 → 500 → 300, separate for policy and value) with a horizon of 32 768, minibatches of 2 048, four epochs, {} \
-             threads, and {} matrix products. Only PPO is measured, without the supervised network (`trainer.supervised`). All learners \
-             alternate in one process; figures are medians of {} rounds.",
+             threads on every side, the same allocator, and {} matrix products. Only PPO is measured, without the supervised network \
+             (`trainer.supervised`). All learners alternate in one process; figures are medians of {} rounds, and a ratio compares one round \
+             (smallest–largest). CPU is the processor time of all threads. Rollouts are the same on all sides: eight rows in a forward pass, or \
+             512 (64 waiting ticks of eight vehicles, or 512 sub-environments).",
             measured.threads,
             measured.precision,
-            measured.update_s.ours.len()
+            measured.updates.first().map_or(0, |ours| ours.wall_s.len())
         ),
     );
-    report.tables = vec![
-        updates(&mut report, &measured.update_s)?,
-        rollouts(&mut report, &measured.horizon_s)?,
-        ticks(&mut report, &measured.ticks),
-    ];
+    let first = ["one update", "sample-visits/s"];
+    let mut tables = vec![learners(
+        &mut report,
+        "update",
+        first,
+        HORIZON * EPOCHS,
+        &measured.updates,
+    )?];
+    for rollout in &measured.rollouts {
+        let label = match rollout.window {
+            1 => "rollout and update, a tick in a forward pass".to_owned(),
+            window => format!("rollout and update, {window} ticks in a forward pass"),
+        };
+        let first = [label.as_str(), "env-steps/s"];
+        tables.push(learners(&mut report, &label, first, HORIZON, &rollout.learners)?);
+    }
+    tables.push(ticks(&mut report, &measured.ticks));
+    report.tables = tables;
     Ok(report)
 }
 
-fn updates(report: &mut BenchReport, seconds: &UpdateTimes) -> Result<ReportTable, Exit> {
-    let visits = HORIZON * EPOCHS;
-    let columns = ["one update", "sample-visits/s", "ours is faster by", "smallest–largest"];
+/// A row for each learner, the first of which is ours; `amount` is done in a round.
+fn learners(
+    report: &mut BenchReport,
+    label: &str,
+    first: [&str; 2],
+    amount: f64,
+    learners: &[LearnerTimes],
+) -> Result<ReportTable, Exit> {
+    let Some(ours) = learners.first() else {
+        return Err(Exit::run("a measurement without a learner", ""));
+    };
+    let columns = [first[0], first[1], "ours is faster by", "CPU s", "CPU, × ours"];
     let mut table = ReportTable::new("", &columns);
-    table.row([
-        "ours".into(),
-        rate(&seconds.ours, visits)?,
-        String::new(),
-        String::new(),
-    ]);
-    for (name, theirs) in [
-        ("plain loop (CleanRL's manner)", &seconds.plain),
-        ("Stable-Baselines3's PPO", &seconds.sb3),
-    ] {
-        let [ratio, range] = compare(report, &format!("update, ratio to {name}"), &seconds.ours, theirs)?;
-        table.row([name.into(), rate(theirs, visits)?, ratio, range]);
+    for each in learners {
+        let rate = MedianSpread::of(each.wall_s.iter().map(|seconds| amount / seconds))?.median;
+        let cpu_s = MedianSpread::of(each.cpu_s.iter().copied())?.median;
+        let [mut wall, mut cpu] = [String::new(), String::new()];
+        if each.name != ours.name {
+            let (of_wall, of_cpu) = (ratio(&each.wall_s, &ours.wall_s)?, ratio(&each.cpu_s, &ours.cpu_s)?);
+            report.figure(format!("{label}, ratio to {}", each.name), of_wall.median);
+            report.figure(format!("{label}, CPU, ratio to {}", each.name), of_cpu.median);
+            [wall, cpu] = [format!("{of_wall} ×"), format!("{of_cpu} ×")];
+        }
+        table.row([
+            each.name.clone(),
+            format!("{rate:.0}"),
+            wall,
+            format!("{cpu_s:.2}"),
+            cpu,
+        ]);
     }
     Ok(table)
 }
 
-fn rollouts(report: &mut BenchReport, seconds: &HorizonTimes) -> Result<ReportTable, Exit> {
-    let columns = [
-        "rollout and update, free environment",
-        "env-steps/s",
-        "ours is faster by",
-        "smallest–largest",
-    ];
-    let mut table = ReportTable::new("", &columns);
-    let ours = rate(&seconds.ours, HORIZON)?;
-    table.row(["ours, 8 vehicles".into(), ours, String::new(), String::new()]);
-    let name = "rollout and update, ratio to Stable-Baselines3's PPO";
-    let [ratio, range] = compare(report, name, &seconds.ours, &seconds.sb3)?;
-    let theirs = rate(&seconds.sb3, HORIZON)?;
-    table.row(["Stable-Baselines3's PPO, 8 environments".into(), theirs, ratio, range]);
-    Ok(table)
+/// Their seconds to ours, round by round.
+fn ratio(theirs: &[f64], ours: &[f64]) -> Result<MedianSpread, Exit> {
+    MedianSpread::of(theirs.iter().zip(ours).map(|(theirs, ours)| theirs / ours))
 }
 
 fn ticks(report: &mut BenchReport, ticks: &[TickTimes]) -> ReportTable {
@@ -137,20 +157,4 @@ fn ticks(report: &mut BenchReport, ticks: &[TickTimes]) -> ReportTable {
         );
     }
     table
-}
-
-/// Median rate of rounds of `amount` each.
-fn rate(seconds: &[f64], amount: f64) -> Result<String, Exit> {
-    let spread = MedianSpread::of(seconds.iter().map(|seconds| amount / seconds))?;
-    Ok(format!("{:.0}", spread.median))
-}
-
-/// Ratio of their time to ours, round by round: the median, and the smallest and the largest.
-fn compare(report: &mut BenchReport, name: &str, ours: &[f64], theirs: &[f64]) -> Result<[String; 2], Exit> {
-    let spread = MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| theirs / ours))?;
-    report.figure(name, spread.median);
-    Ok([
-        format!("{:.2} ×", spread.median),
-        format!("{:.2}–{:.2}", spread.smallest, spread.largest),
-    ])
 }

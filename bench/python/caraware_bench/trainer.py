@@ -1,7 +1,10 @@
 """`python -m caraware_bench.trainer [--pairs N] [--threads N]`: compares the learner with SB3 and a plain loop.
 
-All learners have the same networks, horizon, minibatches, epochs and threads, and alternate in one process. The program
-prints JSON, which `caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.
+All learners have the same networks, horizon, minibatches, epochs and threads, and alternate in one process: ours, the
+same PPO with its plain update, a plain loop, Stable-Baselines3's PPO. Rollouts are measured twice, alike on all sides:
+with one forward pass for each tick of eight vehicles, and with one for 64 ticks that wait (as many sub-environments
+where a learner steps its environments). The program prints JSON, which `caraware bench trainer` turns into a report. A
+sample visit is one sample in one epoch.
 """
 
 import argparse
@@ -11,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +25,7 @@ from torch.distributions import Normal
 
 from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array
 from caraware.learn.batch import Batch
-from caraware.learn.build import build_ppo
+from caraware.learn.build import build_ppo, paper_networks
 from caraware.learn.config import (
     BuiltInNetwork,
     EstimateTimes,
@@ -31,7 +35,7 @@ from caraware.learn.config import (
     TrainerConfig,
     TrainerDevice,
 )
-from caraware.learn.ppo import Ppo
+from caraware.learn.ppo import PlainUpdate, Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Mean
 from caraware.tasks.localisation import Localisation, raw_errors_m
@@ -44,6 +48,9 @@ if TYPE_CHECKING:
 OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
 VEHICLES = 8
 WINDOW_TICKS = 64
+"""Ticks that wait together where forward passes are batched."""
+OURS, PLAIN_UPDATE = "ours", "ours with the plain update"
+PLAIN_LOOP, SB3 = "plain loop (CleanRL's manner)", "Stable-Baselines3's PPO"
 SIZES = (50, 500, 5_000)
 """Numbers of vehicles for the cost of a tick."""
 BOUNDS = MapBounds(0.0, 0.0, 220.0, 220.0)
@@ -180,6 +187,7 @@ class FreeTicks:
     """Windows of ticks with `vehicles` vehicles, without end."""
 
     vehicles: int
+    window: int = WINDOW_TICKS
     _tick: FreeTick = field(init=False)
 
     def __post_init__(self) -> None:
@@ -199,8 +207,8 @@ class FreeTicks:
     def __iter__(self) -> Iterator[list[FreeTick]]:
         tick = 0
         while True:
-            window = [FreeTick(**vars(self._tick) | {"tick": tick + i}) for i in range(WINDOW_TICKS)]
-            tick += WINDOW_TICKS
+            window = [FreeTick(**vars(self._tick) | {"tick": tick + i}) for i in range(self.window)]
+            tick += self.window
             yield window
 
 
@@ -220,8 +228,39 @@ def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> 
     ppo.learn(rollout.take())
 
 
-def sb3_model() -> "PPO":
-    """Stable-Baselines3's PPO with the same sizes, on an environment without a simulation."""
+def plain_horizon(agent: PlainAgent, adam: torch.optim.Adam, rows: int) -> None:
+    """Collect a horizon with `rows` rows in each forward pass, and make its update: the plain loop."""
+    observation = torch.rand(rows, OBSERVATIONS) * 2 - 1
+    columns: list[tuple[Tensor, ...]] = []
+    for _ in range(HORIZON // rows):
+        with torch.no_grad():
+            mean = agent.mean(observation)
+            normal = Normal(mean, agent.log_std.expand_as(mean).exp())
+            action = normal.sample()
+            value = agent.value(observation).squeeze(1)
+        reward = -(action - observation[:, :2]).square().sum(1)
+        columns.append((observation, action, normal.log_prob(action).sum(1), reward, reward - value))
+    observations, actions, log_probabilities, rewards, advantages = (
+        torch.cat(column) for column in zip(*columns, strict=True)
+    )
+    nothing = torch.zeros(HORIZON)
+    batch = Batch(
+        observation=observations,
+        action=actions,
+        log_probability=log_probabilities,
+        reward=rewards,
+        advantage=advantages,
+        value_target=rewards,
+        truth=torch.zeros(HORIZON, 4),
+        metrics={},
+        vehicle=nothing.long(),
+        tick=nothing.long(),
+    )
+    plain_update(agent, adam, batch)
+
+
+def sb3_model(rows: int) -> "PPO":
+    """Stable-Baselines3's PPO with the same sizes, on an environment without a simulation that has `rows` parts."""
     from gymnasium import spaces
     from stable_baselines3 import PPO
     from stable_baselines3.common.logger import Logger
@@ -231,9 +270,9 @@ def sb3_model() -> "PPO":
         def __init__(self) -> None:
             box = spaces.Box(-1, 1, (OBSERVATIONS,), np.float32)
             self.render_mode = None
-            super().__init__(VEHICLES, box, spaces.Box(-1, 1, (2,), np.float32))
-            self._observation = np.random.default_rng(1).uniform(-1, 1, (VEHICLES, OBSERVATIONS)).astype(np.float32)
-            self._infos: list[dict[str, Any]] = [{} for _ in range(VEHICLES)]
+            super().__init__(rows, box, spaces.Box(-1, 1, (2,), np.float32))
+            self._observation = np.random.default_rng(1).uniform(-1, 1, (rows, OBSERVATIONS)).astype(np.float32)
+            self._infos: list[dict[str, Any]] = [{} for _ in range(rows)]
 
         def reset(self) -> Float32Array:
             return self._observation
@@ -243,13 +282,13 @@ def sb3_model() -> "PPO":
 
         def step_wait(self) -> "VecEnvStepReturn":
             reward = -np.square(self._actions - self._observation[:, :2]).sum(1)
-            return self._observation, reward, np.zeros(VEHICLES, bool), self._infos
+            return self._observation, reward, np.zeros(rows, bool), self._infos
 
         def close(self) -> None:
             pass
 
         def get_attr(self, attr_name: str, indices: object = None) -> list[Any]:
-            return [getattr(self, attr_name)] * VEHICLES
+            return [getattr(self, attr_name)] * rows
 
         def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
             setattr(self, attr_name, value)
@@ -258,12 +297,12 @@ def sb3_model() -> "PPO":
             raise NotImplementedError(method_name)
 
         def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
-            return [False] * VEHICLES
+            return [False] * rows
 
     model = PPO(
         "MlpPolicy",
         FreeEnv(),
-        n_steps=HORIZON // VEHICLES,
+        n_steps=HORIZON // rows,
         batch_size=BATCH,
         n_epochs=EPOCHS,
         learning_rate=1e-4,
@@ -276,9 +315,44 @@ def sb3_model() -> "PPO":
 
 def seconds(work: Callable[[], object]) -> float:
     """Wall time of one call."""
-    start = time.perf_counter()
+    return cost(work)[0]
+
+
+def cost(work: Callable[[], object]) -> tuple[float, float]:
+    """Wall time and processor time of all threads of one call, seconds."""
+    cpu_s, wall_s = time.process_time(), time.perf_counter()
     work()
-    return time.perf_counter() - start
+    return time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+
+class Contest:
+    """Pieces of work that alternate, each the same for every learner."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads, self._own_threads = threads, torch.get_num_threads()
+        self._work: dict[str, tuple[Callable[[], object], bool]] = {}
+        self.costs: dict[str, list[tuple[float, float]]] = {}
+
+    def add(self, learner: str, work: Callable[[], object], *, sets_threads: bool = False) -> None:
+        """`sets_threads`: the learner has set torch's threads; the others get all of `threads` within an operation."""
+        self._work[learner], self.costs[learner] = (work, sets_threads), []
+
+    def round(self, *, counts: bool) -> None:
+        """Every learner once; the first round warms up and does not count."""
+        for learner, (work, sets_threads) in self._work.items():
+            torch.set_num_threads(self._own_threads if sets_threads else self._threads)
+            try:
+                taken = cost(work)
+            finally:
+                torch.set_num_threads(self._own_threads)
+            self.costs[learner] += [taken] if counts else []
+
+    def figures(self) -> list[dict[str, object]]:
+        """Seconds by learner and round."""
+        return [
+            {"name": name, "wall_s": [wall for wall, _ in each], "cpu_s": [cpu for _, cpu in each]}
+            for name, each in self.costs.items()
+        ]
 
 
 def python_calls(work: Callable[[], object]) -> int:
@@ -315,6 +389,28 @@ def measure_tick(ppo: Ppo, vehicles: int) -> dict[str, float]:
     }
 
 
+def plain_ppo(config: TrainerConfig, task: Localisation) -> Ppo:
+    """Our PPO with the update that the fast one is tested against: autograd and `torch.optim.Adam`."""
+    generator = torch.Generator().manual_seed(config.seed)
+    policy, value = paper_networks(config, OBSERVATIONS, task.actions.size, generator)
+    update = PlainUpdate(config, policy, value, torch.device("cpu"))
+    return Ppo(config, task, OBSERVATIONS, update, generator, (0,))
+
+
+def rollout_contest(threads: int, window: int) -> Contest:
+    """Horizons with their updates: `window` ticks of eight vehicles, or as many sub-environments, in a forward pass."""
+    config, contest = learner_config(threads), Contest(threads)
+    task = Localisation(BOUNDS, config.reward, config.reward_scale_m)
+    for name, ppo in ((OURS, build_ppo(config, OBSERVATIONS, task)), (PLAIN_UPDATE, plain_ppo(config, task))):
+        rollout, ticks = Rollout(HORIZON, OBSERVATIONS, bootstrap=False), iter(FreeTicks(VEHICLES, window))
+        contest.add(name, partial(our_horizon, ppo, rollout, ticks), sets_threads=name == OURS)
+    agent, model = PlainAgent(), sb3_model(VEHICLES * window)
+    adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)
+    contest.add(PLAIN_LOOP, partial(plain_horizon, agent, adam, VEHICLES * window))
+    contest.add(SB3, partial(model.learn, HORIZON, reset_num_timesteps=False))
+    return contest
+
+
 def main() -> None:
     """Measure all learners in turn and print the seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -323,37 +419,26 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the seconds, in place of standard output")
     options = parser.parse_args()
     config = learner_config(options.threads)
-    ppo = build_ppo(config, OBSERVATIONS, Localisation(BOUNDS, config.reward, config.reward_scale_m))
-    own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
-    batch, agent, model = random_batch(ppo), PlainAgent(), sb3_model()
+    task = Localisation(BOUNDS, config.reward, config.reward_scale_m)
+    ppo = build_ppo(config, OBSERVATIONS, task)
+    updates = Contest(options.threads)
+    batch, agent, plain = random_batch(ppo), PlainAgent(), plain_ppo(config, task)
     adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)
-    rollout, ticks = Rollout(HORIZON, OBSERVATIONS, bootstrap=False), iter(FreeTicks(VEHICLES))
+    model = sb3_model(VEHICLES)
     model.learn(HORIZON)
-
-    def theirs(work: Callable[[], object]) -> float:
-        torch.set_num_threads(options.threads)
-        try:
-            return seconds(work)
-        finally:
-            torch.set_num_threads(own_threads)
-
-    pairs: dict[str, list[float]] = {name: [] for name in ("ours", "plain", "sb3", "our_horizon", "sb3_horizon")}
+    updates.add(OURS, lambda: ppo.update(batch), sets_threads=True)
+    updates.add(PLAIN_UPDATE, lambda: plain.update(batch))
+    updates.add(PLAIN_LOOP, lambda: plain_update(agent, adam, batch))
+    updates.add(SB3, model.train)
+    rollouts = {window: rollout_contest(options.threads, window) for window in (1, WINDOW_TICKS)}
     for number in range(options.pairs + 1):
-        round_s = {
-            "plain": theirs(lambda: plain_update(agent, adam, batch)),
-            "ours": seconds(lambda: ppo.update(batch)),
-            "sb3": theirs(model.train),
-            "our_horizon": seconds(lambda: our_horizon(ppo, rollout, ticks)),
-            "sb3_horizon": theirs(lambda: model.learn(HORIZON, reset_num_timesteps=False)),
-        }
-        for name, value in round_s.items():
-            # The first round is a warm-up and does not count.
-            pairs[name] += [value] if number > 0 else []
+        for contest in (updates, *rollouts.values()):
+            contest.round(counts=number > 0)
     result = {
         "threads": options.threads,
-        "precision": precision,
-        "update_s": {name: pairs[name] for name in ("ours", "plain", "sb3")},
-        "horizon_s": {"ours": pairs["our_horizon"], "sb3": pairs["sb3_horizon"]},
+        "precision": torch.get_float32_matmul_precision(),
+        "updates": updates.figures(),
+        "rollouts": [{"window": window, "learners": contest.figures()} for window, contest in rollouts.items()],
         "ticks": [measure_tick(ppo, vehicles) for vehicles in SIZES],
     }
     if options.json:
