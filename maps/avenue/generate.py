@@ -58,15 +58,9 @@ def shape(start: str, end: str) -> list[Point]:
     if corner is None:
         return [a, b]
     towards_a, towards_b = direction(corner, a), direction(corner, b)
-    middle = tuple(
-        corner[i] + CORNER_M * (towards_a[i] + towards_b[i]) for i in range(2)
-    )
+    middle = tuple(corner[i] + CORNER_M * (towards_a[i] + towards_b[i]) for i in range(2))
     arc = [
-        tuple(
-            middle[i]
-            - CORNER_M * (math.cos(t) * towards_b[i] + math.sin(t) * towards_a[i])
-            for i in range(2)
-        )
+        tuple(middle[i] - CORNER_M * (math.cos(t) * towards_b[i] + math.sin(t) * towards_a[i]) for i in range(2))
         for t in (step * math.pi / 24 for step in range(13))
     ]
     return [a, *((x, y) for x, y in arc), b]
@@ -91,10 +85,7 @@ def nodes() -> str:
         'projParameter="+proj=tmerc +lat_0=52.27 +lon_0=10.53 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"/>'
     )
     lines = [location]
-    lines += [
-        f'<node id="{name}" x="{x:.1f}" y="{y:.1f}" type="traffic_light"/>'
-        for name, (x, y) in NODES.items()
-    ]
+    lines += [f'<node id="{name}" x="{x:.1f}" y="{y:.1f}" type="traffic_light"/>' for name, (x, y) in NODES.items()]
     return document("nodes", lines)
 
 
@@ -108,9 +99,7 @@ def edges() -> str:
             ("-", end, start, points[::-1]),
         ):
             drawn = f' shape="{written(way)}"' if len(way) > 2 else ""
-            lines.append(
-                f'<edge id="{sign}{name}" from="{a}" to="{b}" type="street" numLanes="{lanes}"{drawn}/>'
-            )
+            lines.append(f'<edge id="{sign}{name}" from="{a}" to="{b}" type="street" numLanes="{lanes}"{drawn}/>')
     return document("edges", lines)
 
 
@@ -152,10 +141,7 @@ def house(points: list[Point], place: float, side: float, lanes: int) -> list[Po
         (HOUSE_M[0] / 2, front + HOUSE_M[1]),
         (-HOUSE_M[0] / 2, front + HOUSE_M[1]),
     )
-    outline = [
-        tuple(foot[i] + u * along[i] + v * away[i] for i in range(2))
-        for u, v in corners
-    ]
+    outline = [tuple(foot[i] + u * along[i] + v * away[i] for i in range(2)) for u, v in corners]
     return [(x, y) for x, y in (*outline, outline[0])]
 
 
@@ -169,10 +155,7 @@ def is_free(outline: list[Point], own: str) -> bool:
             steps = max(2, int(length / 2))
             for step in range(steps + 1):
                 point = tuple(a[i] + (b[i] - a[i]) * step / steps for i in range(2))
-                if (
-                    min(math.dist(point, corner) for corner in outline)
-                    < lanes * LANE_M + PAVEMENT_M + 3.0
-                ):
+                if min(math.dist(point, corner) for corner in outline) < lanes * LANE_M + PAVEMENT_M + 3.0:
                     return False
     return True
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use ipc_schema::{
     block::{self, BlockError},
     board::State,
-    config::{Config, ImuConvention, RoadsideConfig},
+    config::{Config, ImuConvention, RoadsideUnitConfig},
     digest::ObservationDigest,
     failure::{Failure, FailureKind},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
@@ -85,7 +85,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 fn units_are_on_the_map(run: &RunFile) -> Result<(), Failure> {
     let [x_min, y_min, x_max, y_max] = run.map.bounds_m;
     let is_outside =
-        |unit: &&RoadsideConfig| !(x_min..=x_max).contains(&unit.x_m) || !(y_min..=y_max).contains(&unit.y_m);
+        |unit: &&RoadsideUnitConfig| !(x_min..=x_max).contains(&unit.x_m) || !(y_min..=y_max).contains(&unit.y_m);
     match run.config.v2x.roadside.iter().find(is_outside) {
         None => Ok(()),
         Some(unit) => Err(Failure::new(

@@ -1,7 +1,7 @@
 //! Roadside units: stations at fixed places, which were surveyed.
 
 use ipc_schema::{
-    config::{RoadsideConfig, V2xConfig},
+    config::{RoadsideUnitConfig, V2xConfig},
     traffic::id_hash,
 };
 use sim_core::scene::Scene;
@@ -20,7 +20,7 @@ pub const NO_ROW: u32 = u32::MAX;
 #[derive(Debug, Clone)]
 pub struct RoadsideUnit {
     /// As it is configured.
-    pub config: RoadsideConfig,
+    pub config: RoadsideUnitConfig,
     /// Hash of its name.
     pub id_hash: u64,
     /// Antenna and sensors.
@@ -34,7 +34,7 @@ pub struct RoadsideUnit {
 impl RoadsideUnit {
     /// A unit on the ground of a scene.
     #[must_use]
-    pub fn new(config: &RoadsideConfig, v2x: &V2xConfig, scene: &Scene) -> Self {
+    pub fn new(config: &RoadsideUnitConfig, v2x: &V2xConfig, scene: &Scene) -> Self {
         let position_m = [config.x_m, config.y_m];
         let road = scene.road();
         let nearest = || road.nearest(position_m, GROUND_REACH_M, |_| true);

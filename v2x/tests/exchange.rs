@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use ipc_schema::{
-    config::{Config, RoadsideConfig, RoadsideService, V2xAwareness, V2xListing},
+    config::{Config, RoadsideService, RoadsideUnitConfig, V2xAwareness, V2xListing},
     header::{FIRST_OF_EPISODE, MessageHeader},
     neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     run::MapInfo,
@@ -301,8 +301,8 @@ fn emergency_braking_is_warned_of_where_it_is_configured() {
     assert!(warned.iter().zip(&blocks).all(|(a, b)| a.of(0).len() == b.of(0).len()));
 }
 
-fn roadside(id: &str, x_m: f64, y_m: f64, services: &[RoadsideService]) -> RoadsideConfig {
-    RoadsideConfig {
+fn roadside(id: &str, x_m: f64, y_m: f64, services: &[RoadsideService]) -> RoadsideUnitConfig {
+    RoadsideUnitConfig {
         id: id.into(),
         x_m,
         y_m,
@@ -370,7 +370,7 @@ fn a_roadside_unit_sees_its_field_of_view() {
     config.v2x.pcap = true;
     let seen = |heading_deg, field_of_view_deg| {
         let mut config = config.clone();
-        config.v2x.roadside = vec![RoadsideConfig {
+        config.v2x.roadside = vec![RoadsideUnitConfig {
             heading_deg: Some(heading_deg),
             field_of_view_deg,
             ..roadside("corner", 0.0, 0.0, &[RoadsideService::Cpm])

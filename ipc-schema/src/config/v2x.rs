@@ -101,7 +101,7 @@ impl fmt::Display for RoadsideService {
 /// A roadside unit: a station at a fixed place.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct RoadsideConfig {
+pub struct RoadsideUnitConfig {
     /// Name, of which the station id follows.
     pub id: String,
     /// Place, world, metres.
@@ -120,7 +120,7 @@ pub struct RoadsideConfig {
     pub services: Option<Vec<RoadsideService>>,
 }
 
-impl RoadsideConfig {
+impl RoadsideUnitConfig {
     /// Range in which it perceives, metres; 0 = it perceives nothing.
     #[must_use]
     pub fn range_m(&self) -> f64 {
@@ -158,7 +158,7 @@ pub struct V2xConfig {
     /// Which descriptions of objects such a row lists.
     pub listing: V2xListing,
     /// Stations at fixed places.
-    pub roadside: Vec<RoadsideConfig>,
+    pub roadside: Vec<RoadsideUnitConfig>,
     /// Every message on air is written into files that protocol analysers open.
     pub pcap: bool,
     /// Formulas of path loss.

@@ -193,7 +193,13 @@ pub const ROADSIDE_KEYS: &[ConfigKey] = &[
 ];
 
 /// Keys of entries of lists of tables.
-const ENTRY_KEYS: [&[ConfigKey]; 5] = [STAGE_KEYS, SUITE_KEYS, SUITE_SENSOR_KEYS, ROADSIDE_KEYS, ROADSIDE_UNIT_KEYS];
+const ENTRY_KEYS: [&[ConfigKey]; 5] = [
+    STAGE_KEYS,
+    SUITE_KEYS,
+    SUITE_SENSOR_KEYS,
+    ROADSIDE_KEYS,
+    ROADSIDE_UNIT_KEYS,
+];
 
 /// Path of the sensors of a suite.
 pub const SUITE_SENSORS: &str = "suite.sensor";
