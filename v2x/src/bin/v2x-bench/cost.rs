@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use ipc_schema::{config::Config, usage};
 
-use crate::street::{BIN_M, Delivery, NeighboursBlock, StreetRun, count};
+use crate::street::{BIN_M, DeliveredShare, NeighboursBlock, StreetRun, count};
 
 /// Simulated seconds that are measured, after one that is not.
 const SECONDS: u64 = 5;
@@ -23,7 +23,7 @@ fn measure(stations: usize, perception_range_m: f64, threads: u32) {
     config.v2x.perception_range_m = perception_range_m;
     let mut run = StreetRun::new(stations, &config);
     let mut obstacles = run.obstacles();
-    let mut bins = [[Delivery::default(); 10]; 3];
+    let mut bins = [[DeliveredShare::default(); 10]; 3];
     let (mut work_s, mut wall_s, mut load, mut age_s, mut known) = (0.0, 0.0, 0.0, Vec::new(), 0_u64);
     let mut blocks = 0xCBF2_9CE4_8422_2325;
     let mut before = run.exchange.counts();

@@ -17,7 +17,7 @@ use v2x::{
     random::{LinkKey, RadioDraw, RadioRandom},
 };
 
-use crate::street::{BIN_M, Delivery, StreetRun, StreetTick, count};
+use crate::street::{BIN_M, DeliveredShare, StreetRun, StreetTick, count};
 
 /// Distance within which a vehicle should know the others, metres.
 const AWARENESS_M: f64 = 100.0;
@@ -86,7 +86,7 @@ pub fn measure_all(is_quick: bool, file: Option<&str>) {
         false => (250, 10, &[0.1, 0.3, 0.5, 0.7, 1.0]),
     };
     let mut sizes = Sizes::new();
-    let mut bins = [[Delivery::default(); 10]; 3];
+    let mut bins = [[DeliveredShare::default(); 10]; 3];
     let mut cases = Vec::new();
     for has_perception in [false, true] {
         for share in shares {
@@ -101,7 +101,7 @@ pub fn measure_all(is_quick: bool, file: Option<&str>) {
         }
     }
     let states = ["line of sight", "behind vehicles", "behind houses"];
-    let curve = |bins: &[Delivery; 10]| {
+    let curve = |bins: &[DeliveredShare; 10]| {
         let points = bins.iter().enumerate().filter(|(_, bin)| bin.sent > 0);
         points
             .map(|(number, bin)| {
@@ -133,7 +133,7 @@ fn measure(
     share: f64,
     has_perception: bool,
     sizes: &mut Sizes,
-    bins: &mut [[Delivery; 10]; 3],
+    bins: &mut [[DeliveredShare; 10]; 3],
 ) -> CaseFigures {
     let mut config: Config = serde_json::from_str(include_str!("../../../../ipc-schema/tests/town.json")).unwrap();
     config.v2x.share = share;

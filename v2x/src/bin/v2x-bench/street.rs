@@ -206,7 +206,7 @@ impl StreetRun {
 
 /// Messages that were sent to receivers at a distance, and those that arrived.
 #[derive(Default, Clone, Copy)]
-pub struct Delivery {
+pub struct DeliveredShare {
     pub sent: u64,
     pub received: u64,
 }
@@ -216,7 +216,7 @@ pub fn count(
     exchange: &MessageExchange,
     obstacles: &Obstacles,
     states: &[VehicleState],
-    bins: &mut [[Delivery; 10]; 3],
+    bins: &mut [[DeliveredShare; 10]; 3],
 ) {
     let antenna = |slot: usize| Antenna {
         position_m: obstacles.bodies()[slot].centre_m,
