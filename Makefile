@@ -98,7 +98,7 @@ wheels: build ## wheels of the trainer with all programs, and of the viewer: tar
 install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/bin/caraware
 	@if [ -z "$(PREFIX)" ]; then echo "make install PREFIX=DIRECTORY makes an environment there" >&2; exit 2; fi
 	$(PYTHON) -m venv $(PREFIX)
-	$(call PINS,$(PREFIX),trainer[$(EXTRAS)] viewer)
+	$(call PINS,$(PREFIX),'trainer[$(EXTRAS)]' viewer)
 	$(PREFIX)/bin/pip install --disable-pip-version-check --quiet --no-deps --force-reinstall target/wheels/*.whl
 
 image: ## a container image of Containerfile, by podman, buildah or docker
