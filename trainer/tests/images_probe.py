@@ -32,6 +32,7 @@ def compare(obs: Observation, watched: list[Image], found: dict[str, Any]) -> No
             continue
         slots = np.flatnonzero(np.asarray(obs.vehicle) == image.vehicle)
         found["watched"] += 1
+        assert image.semantic is not None
         same = len(slots) == 1 and np.array_equal(obs.images[int(slots[0]), 0], image.semantic)
         found["unlike"] += int(not same)
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 from caraware.data.export.scans import box_middle, forward_m, require_channels
 from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
-from caraware.ipc.arrays import Float64Array
+from caraware.ipc.arrays import Float64Array, FloatArray
 
 LABELLED_WITHIN_M = 150.0
 """Distance from the LIDAR up to which road users are labelled."""
@@ -79,7 +79,7 @@ def _box(state: np.void) -> dict[str, Any]:
     }
 
 
-def mask_pixel(lidar_m: Float64Array) -> Float64Array:
+def mask_pixel(lidar_m: FloatArray) -> FloatArray:
     """f64 [count, 2]: column and row of points [count, 2 or 3] in the LIDAR's left-handed frame: ahead is up."""
     return MASK_MIDDLE + np.stack((lidar_m[:, 1], -lidar_m[:, 0]), 1) / MASK_PIXEL_M
 

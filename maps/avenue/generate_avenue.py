@@ -1,6 +1,6 @@
 """Writes the sources of the avenue: junctions, streets and buildings, as netconvert and SUMO read them.
 
-`python maps/avenue/generate.py` writes them beside this file; the same program writes the same bytes.
+`python maps/avenue/generate_avenue.py` writes them beside this file; the same program writes the same bytes.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def is_free(outline: list[Point], own: str) -> bool:
 def document(tag: str, lines: list[str]) -> str:
     """A whole file."""
     body = "".join(f"    {line}\n" for line in lines)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n<!-- Written by generate.py. -->\n<{tag}>\n{body}</{tag}>\n'
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n<!-- Written by generate_avenue.py. -->\n<{tag}>\n{body}</{tag}>\n'
 
 
 def main() -> None:
