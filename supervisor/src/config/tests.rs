@@ -418,7 +418,9 @@ fn a_gate_names_a_metric_of_the_task_and_the_value_that_it_must_reach() {
         "my.toml:6: `curriculum.stages.until_metric` cannot be \"error_km\""
     );
     assert!(
-        help.starts_with("allowed: \"error_m\", \"progress_mps\", \"route_offset_m\". "),
+        help.starts_with(
+            "allowed: \"error_m\", \"progress_mps\", \"route_offset_m\", \"lateral_error_m\", \"wrong_lane_percent\". "
+        ),
         "{help}"
     );
     let (message, help) = error_of(&with("until_value = 6.0\nuntil_metric = \"progress_mps\""));
