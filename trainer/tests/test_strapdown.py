@@ -54,6 +54,8 @@ class Windows:
     """bool [count]: the vehicle was led along its path in a tick of the window."""
     climb_m: Float64Array
     """f64 [count]: difference of the highest and the lowest point."""
+    roll_rad: Float64Array
+    """f64 [count]: largest roll to either side."""
 
 
 def windows(run_dir: Path, duration_s: float) -> Windows:
@@ -86,6 +88,7 @@ def windows(run_dir: Path, duration_s: float) -> Windows:
         end=moved[:, -1],
         guided=np.asarray((moved["flags"] & GUIDED).any(1)),
         climb_m=np.ptp(moved["z_m"], 1),
+        roll_rad=np.abs(moved["roll_rad"]).max(1),
     )
 
 
@@ -183,7 +186,7 @@ def test_samples_without_noise_lead_to_the_truth(
     stretch = windows(runs["exact"], duration_s)
     errors, _ = navigate(stretch)
     assert len(errors) >= 20 and stretch.climb_m.max() > 2.0
-    assert np.abs(stretch.end["roll_rad"]).max() > 0.05
+    assert stretch.roll_rad.max() > 0.05
     away = np.linalg.norm(errors[:, 6:], axis=1)
     print(
         f"{len(away)} times {duration_s} s: {away[~stretch.guided].max():.5f} m, led {away[stretch.guided].max():.4f} m"

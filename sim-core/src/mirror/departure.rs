@@ -72,16 +72,15 @@ mod tests {
     fn the_first_part_that_is_large_explains_a_contact() {
         let mut departure = Departure::default();
         assert_eq!(departure.cause(), ContactCause::Body);
-        let parts: [(fn(&mut Departure), ContactCause); 5] = [
-            (|departure| departure.tracking_m = 0.4, ContactCause::Tracking),
-            (|departure| departure.path_m = 0.2, ContactCause::Path),
-            (|departure| departure.late_m = 0.6, ContactCause::Late),
-            (|departure| departure.lane_change_m = 0.6, ContactCause::LaneChange),
-            (|departure| departure.is_led = true, ContactCause::Led),
-        ];
-        for (grow, cause) in parts {
-            grow(&mut departure);
-            assert_eq!(departure.cause(), cause);
-        }
+        departure.tracking_m = 0.4;
+        assert_eq!(departure.cause(), ContactCause::Tracking);
+        departure.path_m = 0.2;
+        assert_eq!(departure.cause(), ContactCause::Path);
+        departure.late_m = 0.6;
+        assert_eq!(departure.cause(), ContactCause::Late);
+        departure.lane_change_m = 0.6;
+        assert_eq!(departure.cause(), ContactCause::LaneChange);
+        departure.is_led = true;
+        assert_eq!(departure.cause(), ContactCause::Led);
     }
 }
