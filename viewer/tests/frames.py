@@ -55,7 +55,7 @@ def observation(
     arrays |= {"id_hash": 100 + np.arange(n), "sensors": np.full(n, 7)} | fields
     payload = b""
     for section in layout.SECTIONS["observation"]:
-        shape = section.sized({"slots": n, "fields": d, "imu_samples": k})
+        shape = section.sized({"slots": n, "fields": d, "imu_samples": k, "image_bytes": 0})
         payload += np.asarray(arrays.get(section.name, np.zeros(shape)), section.element).reshape(shape).tobytes()
         payload += bytes(-len(payload) % layout.ALIGNMENT)
     return header(tick, n, d, k) + payload
