@@ -160,7 +160,7 @@ fn between(a: &Rotation, b: &Rotation) -> f64 {
 
 #[test]
 fn acceleration_and_angular_rate_of_every_vehicle_of_the_town_reproduce_its_pose() {
-    let workplace = Workplace::new();
+    let workplace = Workplace::alone();
     let settings = [
         "episode.training_episodes=1",
         "episode.ticks=900",
@@ -216,7 +216,7 @@ fn assert_within_limits(ways: &[Vec<&Moved>]) {
 /// The default preset's mirror follows its reference: p99.9 at most 0.5 m across and 1.0 m along, never more than 2 m.
 #[test]
 fn the_report_measures_how_well_the_town_is_tracked() {
-    let workplace = Workplace::new();
+    let workplace = Workplace::alone();
     let settings = ["--set", "episode.training_episodes=2", "--set", "fanout.enabled=false"];
     workplace.succeed(&[&["simulate", "--name", "tracked"], &settings[..]].concat());
     let tracking = &workplace.report("tracked")["dynamics"]["tracking"];

@@ -41,25 +41,28 @@ pub const BARE_NET_SETTINGS: [&str; 6] = [
 static TAKEN: Mutex<usize> = Mutex::new(0);
 static RETURNED: Condvar = Condvar::new();
 
-/// A test's share of the machine: as many tests run at once as there are cores.
-struct Turn;
+/// A test's share of the machine, in cores: as many tests run at once as there are cores.
+struct Turn(usize);
 
 impl Turn {
-    fn take() -> Self {
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    fn take(share: usize) -> Self {
         let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
         let mut taken = RETURNED
-            .wait_while(taken, |taken| *taken >= cores)
+            .wait_while(taken, |taken| *taken + share > cores())
             .unwrap_or_else(PoisonError::into_inner);
-        *taken += 1;
-        Self
+        *taken += share;
+        Self(share)
     }
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 impl Drop for Turn {
     fn drop(&mut self) {
-        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
-        RETURNED.notify_one();
+        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= self.0;
+        RETURNED.notify_all();
     }
 }
 
@@ -95,7 +98,15 @@ impl Drop for Workplace {
 
 impl Workplace {
     pub fn new() -> Self {
-        let turn = Turn::take();
+        Self::with(Turn::take(1))
+    }
+
+    /// For a test that watches a run at full speed and may miss no tick: no other test of its file runs beside it.
+    pub fn alone() -> Self {
+        Self::with(Turn::take(cores()))
+    }
+
+    fn with(turn: Turn) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("run");
         DirBuilder::new().mode(0o700).create(&path).unwrap();
