@@ -281,7 +281,14 @@ mod tests {
     #[test]
     fn a_metric_of_the_policy_is_written_as_its_name() {
         let names: Vec<&str> = PolicyMetric::all().map(|metric| metric.spec().name).collect();
-        assert_eq!(names, ["error_m", "progress_mps", "route_offset_m"]);
+        let of_tasks = [
+            "error_m",
+            "progress_mps",
+            "route_offset_m",
+            "lateral_error_m",
+            "wrong_lane_percent",
+        ];
+        assert_eq!(names, of_tasks);
         let metric: PolicyMetric = serde_json::from_str("\"error_m\"").unwrap();
         assert_eq!(serde_json::to_string(&metric).unwrap(), "\"error_m\"");
         let error = serde_json::from_str::<PolicyMetric>("\"raw_gnss_error_m\"").unwrap_err();

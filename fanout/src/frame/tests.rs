@@ -111,6 +111,11 @@ fn a_prediction_has_the_slots_of_its_observation() {
             .all(|(vehicle, slot)| *vehicle as usize == *slot && *slot >= 2_000)
     );
     for ((_, from), (name, to)) in layout.named().into_iter().zip(short.named()) {
+        // Frames carry no images.
+        if name == "images" {
+            assert_eq!(to.len, 0);
+            continue;
+        }
         let row = to.len / chosen.len();
         let kept = chosen.iter().map(|slot| &bytes[from.offset + slot * row..][..row]);
         assert!(kept.eq(body[to.offset..][..to.len].chunks_exact(row)), "{name}");
