@@ -29,6 +29,7 @@ NAVIGATION = {
         "docs/glossary",
         "configs/README",
         "maps/town/README",
+        "maps/avenue/README",
         "maps/valley/README",
     ],
     "Tutorials": [
@@ -42,7 +43,14 @@ NAVIGATION = {
         "docs/tutorials/many-machines",
     ],
     "Traffic and vehicles": ["docs/import", "docs/traci", "docs/vehicle-model", "docs/scene", "docs/driving"],
-    "Sensors and messages": ["docs/sensor-models", "docs/lidar", "docs/camera", "docs/suites", "docs/v2x"],
+    "Sensors and messages": [
+        "docs/sensor-models",
+        "docs/lidar",
+        "docs/camera",
+        "docs/suites",
+        "docs/seeing",
+        "docs/v2x",
+    ],
     "Learning": [
         "docs/environments",
         "docs/learners",
@@ -62,6 +70,7 @@ NAVIGATION = {
         "docs/fanout",
         "docs/metrics",
         "docs/recording",
+        "docs/run-directory",
     ],
     "Inside": ["ARCHITECTURE", "docs/extending", "docs/benchmarks", "docs/decisions/README"],
 }
