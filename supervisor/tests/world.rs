@@ -1,4 +1,4 @@
-//! The motion of every vehicle in a whole run on the town, read from the shared memory of the run.
+//! The motion of every vehicle in a whole run on the town, read from its recording.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,20 +8,16 @@
 
 mod common;
 
-use std::{
-    collections::BTreeMap,
-    path::Path,
-    process::{Child, Stdio},
-};
+use std::collections::BTreeMap;
 
-use common::{Spectator, Workplace, caught};
+use common::Workplace;
 use ipc_schema::{
     block,
-    header::LAST_OF_RUN,
-    services::Channel,
+    channel::Channel,
     traffic::Kind,
     world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState, WorldLayout},
 };
+use recorder::file::reader::RecordingReader;
 
 type Vector = [f64; 3];
 /// Columns are the body's axes in the world.
@@ -34,38 +30,26 @@ const SUB_STEP_S: f64 = 0.01;
 /// A vehicle at the end of a tick with the sub-steps that led there.
 type Moved = (VehicleState, Vec<SubStep>);
 
-/// All ticks of a run on the town: all road users in the order of their index.
-fn watch(workplace: &Workplace, settings: &[&str]) -> Vec<Vec<Moved>> {
+/// All ticks of a run on the town from its lossless recording: all road users in the order of their index.
+fn record(workplace: &Workplace, settings: &[&str]) -> Vec<Vec<Moved>> {
     let mut arguments = vec!["simulate", "--name", "world", "--set", "fanout.enabled=false"];
+    arguments.extend(["--record", "--set", "record.channels=[\"world\"]"]);
     settings.iter().for_each(|setting| arguments.extend(["--set", setting]));
-    let mut command = workplace.command(&arguments);
-    let mut run = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let ticks = receive(&workplace.path().join("runs/world/run.json"), &mut run);
-    let output = run.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", common::text(&output));
-    ticks
-}
-
-fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
-    let spectator = Spectator::join(run_file, run);
-    let world = spectator.subscribe(Channel::World);
+    workplace.succeed(&arguments);
+    let recording = RecordingReader::open(&workplace.path().join("runs/world/recording.mcap")).unwrap();
     let mut ticks: Vec<Vec<Moved>> = Vec::new();
-    loop {
-        let message = caught(run, "a tick", || world.receive().unwrap());
-        let header = *message.header();
-        assert_eq!(header.tick, ticks.len() as u64, "a tick was missed");
-        let layout = WorldLayout::of(&header);
+    for message in recording.channel_messages().map(Result::unwrap) {
+        assert_eq!(
+            (message.channel, message.header.tick),
+            (Channel::World, ticks.len() as u64)
+        );
+        let layout = WorldLayout::of(&message.header);
         let states: &[VehicleState] = block::view(message.payload(), layout.states).unwrap();
         let rows: &[SubStep] = block::view(message.payload(), layout.sub_steps).unwrap();
-        let rows = rows.chunks(header.shape[1] as usize).map(<[SubStep]>::to_vec);
+        let rows = rows.chunks(message.header.shape[1] as usize).map(<[SubStep]>::to_vec);
         ticks.push(states.iter().copied().zip(rows).collect());
-        if header.has(LAST_OF_RUN) {
-            drop(message);
-            drop(world);
-            drop(spectator);
-            return ticks;
-        }
     }
+    ticks
 }
 
 /// Consecutive states of each vehicle, split where a pose was set.
@@ -160,14 +144,14 @@ fn between(a: &Rotation, b: &Rotation) -> f64 {
 
 #[test]
 fn acceleration_and_angular_rate_of_every_vehicle_of_the_town_reproduce_its_pose() {
-    let workplace = Workplace::alone();
+    let workplace = Workplace::new();
     let settings = [
         "episode.training_episodes=1",
         "episode.ticks=900",
-        "run.real_time_factor=20.0",
         "traffic.pedestrians=4",
     ];
-    let ticks = watch(&workplace, &settings);
+    let ticks = record(&workplace, &settings);
+    assert_eq!(ticks.len(), 900);
     let ways = ways(&ticks);
     let (mut checked, mut furthest_m, mut most_rad, mut leaning) = (0, 0.0_f64, 0.0_f64, 0.0_f32);
     for way in &ways {
@@ -216,7 +200,7 @@ fn assert_within_limits(ways: &[Vec<&Moved>]) {
 /// The default preset's mirror follows its reference: p99.9 at most 0.5 m across and 1.0 m along, never more than 2 m.
 #[test]
 fn the_report_measures_how_well_the_town_is_tracked() {
-    let workplace = Workplace::alone();
+    let workplace = Workplace::new();
     let settings = ["--set", "episode.training_episodes=2", "--set", "fanout.enabled=false"];
     workplace.succeed(&[&["simulate", "--name", "tracked"], &settings[..]].concat());
     let tracking = &workplace.report("tracked")["dynamics"]["tracking"];

@@ -41,28 +41,25 @@ pub const BARE_NET_SETTINGS: [&str; 6] = [
 static TAKEN: Mutex<usize> = Mutex::new(0);
 static RETURNED: Condvar = Condvar::new();
 
-/// A test's share of the machine, in cores: as many tests run at once as there are cores.
-struct Turn(usize);
+/// One of the tests that run at once: as many as there are cores.
+struct Turn;
 
 impl Turn {
-    fn take(share: usize) -> Self {
+    fn take() -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
         let mut taken = RETURNED
-            .wait_while(taken, |taken| *taken + share > cores())
+            .wait_while(taken, |taken| *taken >= cores)
             .unwrap_or_else(PoisonError::into_inner);
-        *taken += share;
-        Self(share)
+        *taken += 1;
+        Self
     }
-}
-
-fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 impl Drop for Turn {
     fn drop(&mut self) {
-        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= self.0;
-        RETURNED.notify_all();
+        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        RETURNED.notify_one();
     }
 }
 
@@ -98,15 +95,7 @@ impl Drop for Workplace {
 
 impl Workplace {
     pub fn new() -> Self {
-        Self::with(Turn::take(1))
-    }
-
-    /// For a test that watches a run at full speed and may miss no tick: no other test of its file runs beside it.
-    pub fn alone() -> Self {
-        Self::with(Turn::take(cores()))
-    }
-
-    fn with(turn: Turn) -> Self {
+        let turn = Turn::take();
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("run");
         DirBuilder::new().mode(0o700).create(&path).unwrap();
