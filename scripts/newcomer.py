@@ -239,7 +239,7 @@ def main() -> int:
     pages = named or [ROOT / "README.md", *sorted((ROOT / "docs" / "tutorials").glob("*.md"))]
     if not named:
         left_out = sorted(page.stem for page in (ROOT / "docs").glob("*.md"))
-        print(f"not followed, but their command lines are parsed (--test documentation): docs/ {', '.join(left_out)}")
+        print(f"not followed, but their command lines are parsed (--test tree documentation::): docs/ {', '.join(left_out)}")
     results = [run_page(page) for page in pages]
     failures, seconds = sum(count for count, _ in results), sum(time_s for _, time_s in results)
     print(f"{len(pages)} pages in {seconds:.0f} s, {failures} failures")

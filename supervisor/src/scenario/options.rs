@@ -1,6 +1,6 @@
 //! What SUMO does with an option of a `.sumocfg`: the table of all options that name files, ports or other configurations.
 //!
-//! An option that is not listed holds a plain value. `--test scenario_trust` compares the table with the options of the installed SUMO,
+//! An option that is not listed holds a plain value. The test `scenario_trust` compares the table with the options of the installed SUMO,
 //! so a new option that names a file has to be added here first.
 
 /// What SUMO does with the value of an option.

@@ -1,0 +1,272 @@
+//! A curriculum whose gates the learner passes: it gives the same bytes for the same seed, with killed trainers, and from its log.
+
+use std::{
+    process::Child,
+    time::{Duration, Instant},
+};
+
+use crate::common::{CURRICULUM, Spectator, Workplace, short_pause};
+use ipc_schema::{
+    block,
+    observation::{ObservationLayout, VALID},
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services::{self, Channel, RunNode},
+};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Settings in addition to [`CURRICULUM`]: no evaluations in between.
+const MORE: [&str; 3] = [
+    "episode.evaluation_interval=0",
+    "trainer.checkpoint_interval=2",
+    "run.window_ticks=16",
+];
+
+fn arguments<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let settings = CURRICULUM
+        .iter()
+        .chain(&MORE)
+        .chain(more)
+        .flat_map(|setting| ["--set", setting]);
+    [mode, "paper", "--name", name].into_iter().chain(settings).collect()
+}
+
+fn decisions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
+    let text = std::fs::read_to_string(workplace.path().join("runs").join(name).join("curriculum.jsonl")).unwrap();
+    let number = |line: &Value, key: &str| line[key].as_u64().unwrap();
+    let lines = text.lines().map(|line| serde_json::from_str(line).unwrap());
+    lines
+        .map(|line: Value| ["stage", "lesson", "tick"].map(|key| number(&line, key)))
+        .collect()
+}
+
+/// A run under way, and the board of its trainer.
+fn trainer_of(workplace: &Workplace, name: &str, child: &mut Child) -> (RunNode, BoardReader) {
+    let file = workplace.path().join("runs").join(name).join("run.json");
+    loop {
+        assert!(child.try_wait().unwrap().is_none(), "the run is over");
+        if let Ok(run) = RunFile::read(&file)
+            && let Ok(node) = services::node(&run.shared_memory)
+            && let Ok(board) = BoardReader::open(&node, &run, 0, Process::Trainer)
+        {
+            break (node, board);
+        }
+        std::thread::park_timeout(Duration::from_millis(5));
+    }
+}
+
+/// Kills the trainer once it has consumed `tick` ticks as incarnation `incarnation`.
+fn kill_trainer(board: &BoardReader, incarnation: u32, tick: u64) {
+    let deadline = Instant::now() + Duration::from_secs(120);
+    loop {
+        let progress = board.progress();
+        if progress.incarnation == incarnation && progress.attached == 1 && progress.consumed_ticks >= tick {
+            return kill_process(Pid::from_raw(board.health().pid).unwrap(), Signal::KILL).unwrap();
+        }
+        assert!(
+            Instant::now() < deadline,
+            "trainer {incarnation} never got to tick {tick}"
+        );
+        std::thread::park_timeout(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("train", "whole", &[]));
+    let report = workplace.report("whole");
+    let passed = report["trainer"]["curriculum"]["passed"].as_array().unwrap().clone();
+    assert_eq!(passed.len(), 3, "{report:#}");
+    for (gate, limit) in passed.iter().zip([0.66, 0.63, 0.6]) {
+        assert!(gate["policy_std"].as_f64().unwrap() <= limit, "{gate}");
+    }
+    let taken = decisions(&workplace, "whole");
+    assert_eq!(taken.iter().map(|[stage, ..]| *stage).collect::<Vec<_>>(), [0, 1, 2, 3]);
+    // A stage begins with the tick after the one at which the gate before it opened.
+    for (gate, [_, lesson, tick]) in passed.iter().zip(&taken[1..]) {
+        assert_eq!(gate["tick"].as_u64().unwrap() + 1, *tick);
+        assert_eq!(gate["lessons"].as_u64().unwrap(), *lesson);
+    }
+    let last = taken[3];
+    assert_eq!(
+        report["ticks"],
+        last[2] + 80,
+        "nothing but the evaluation follows the last gate"
+    );
+    // Lessons of one vehicle are 450 and 350 ticks, those of five 100.
+    let lessons = |from: usize| taken[from + 1][1] - taken[from][1];
+    assert_eq!(last[2], 450 * lessons(0) + 350 * lessons(1) + 100 * lessons(2));
+
+    // Kills before the first checkpoint, in each stage, and while other processes wait for the decision about the last lesson.
+    let mut command = workplace.command(&arguments("train", "killed", &["run.window_ticks=5"]));
+    let mut child = command.spawn().unwrap();
+    let run = trainer_of(&workplace, "killed", &mut child);
+    let ticks = [200, taken[1][2] - 1, taken[2][2] + 120, last[2] - 1];
+    for (incarnation, tick) in (0..).zip(ticks) {
+        kill_trainer(&run.1, incarnation, tick);
+    }
+    drop(run);
+    assert!(child.wait().unwrap().success());
+    let killed = workplace.report("killed");
+    assert_eq!(killed["observation_hash"], report["observation_hash"]);
+    assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &4.into()));
+    assert_eq!(decisions(&workplace, "killed"), taken);
+    assert_eq!(killed["trainer"]["curriculum"], report["trainer"]["curriculum"]);
+
+    // The training part is made again without a learner.
+    let log = workplace.path().join("runs/whole/curriculum.jsonl");
+    let log = format!("curriculum.log={}", log.display());
+    workplace.succeed(&arguments("simulate", "again", &[&log]));
+    assert_eq!(
+        workplace.report("again")["observation_hash"],
+        report["observation_hash"]
+    );
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
+    let workplace = Workplace::new();
+    let steps = "curriculum.stages=[{cavs=2,until_lessons=1},{cavs=3,until_std=0.001}]";
+    workplace.succeed(&arguments(
+        "train",
+        "stuck",
+        &[steps, "episode.training_episodes=3", "episode.ticks=120"],
+    ));
+    let report = workplace.report("stuck");
+    let curriculum = &report["trainer"]["curriculum"];
+    assert_eq!(
+        (&curriculum["lessons"], curriculum["passed"].as_array().unwrap().len()),
+        (&3.into(), 1)
+    );
+    assert_eq!(report["ticks"], 3 * 120 + 80);
+}
+
+/// Stages over the town and a grid of 300 m: in order, at random, and gradually at random.
+const MAPS: [&str; 5] = [
+    "curriculum.maps=[\"town\",\"city/city.sumocfg\"]",
+    "curriculum.stages=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
+     {cavs=3,until_lessons=6,maps=[\"town\",\"city\"],map_choice=\"random\",noise=2.0},\
+     {cavs=2,until_lessons=8,maps=[\"city\",\"town\"],map_choice=\"gradually_random\"}]",
+    "episode.ticks=120",
+    // The sky view depends on the buildings of each map.
+    "gnss.sky_view=true",
+    "traffic.others=0",
+];
+
+fn with_city() -> Workplace {
+    let workplace = Workplace::new();
+    let size = ["--vehicles", "20", "--junctions", "4", "--block-m", "300"];
+    workplace.succeed(&[&["generate", "city"][..], &size].concat());
+    workplace
+}
+
+/// Lessons by map that follow from a run's configuration and the stages of its lessons.
+fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2] {
+    let run = RunFile::read(&workplace.path().join("runs").join(name).join("run.json")).unwrap();
+    let mut plan = run.curriculum_plan().unwrap();
+    let mut lessons = [0; 2];
+    for stage in steps {
+        lessons[plan.enter(*stage).unwrap().map] += 1;
+    }
+    lessons
+}
+
+#[test]
+fn lessons_are_on_the_maps_of_their_stages_and_the_same_seed_gives_the_same_bytes() {
+    let workplace = with_city();
+    workplace.succeed(&arguments("train", "maps", &MAPS));
+    let report = workplace.report("maps");
+    let maps = &report["traffic"]["maps"];
+    let steps: Vec<usize> = [(0, 4), (1, 6), (2, 8)]
+        .into_iter()
+        .flat_map(|(stage, count)| vec![stage; count])
+        .collect();
+    let expected = lessons_by_map(&workplace, "maps", &steps);
+    assert!(expected.iter().all(|lessons| *lessons > 2), "{expected:?}");
+    for (map, (name, lessons)) in ["town", "city"].into_iter().zip(expected).enumerate() {
+        let usage = serde_json::json!({"name": name, "lessons": lessons, "ticks": 120 * lessons});
+        assert_eq!(maps[map], usage);
+    }
+
+    // Kills before the first checkpoint, and at borders between maps.
+    let mut child = workplace.command(&arguments("train", "killed", &MAPS)).spawn().unwrap();
+    let run = trainer_of(&workplace, "killed", &mut child);
+    for (incarnation, tick) in (0..).zip([120, 600, 1500]) {
+        kill_trainer(&run.1, incarnation, tick);
+    }
+    drop(run);
+    assert!(child.wait().unwrap().success());
+    let killed = workplace.report("killed");
+    assert_eq!(killed["observation_hash"], report["observation_hash"]);
+    assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &3.into()));
+    assert_eq!(&killed["traffic"]["maps"], maps);
+
+    let log = workplace.path().join("runs/maps/curriculum.jsonl");
+    let log = format!("curriculum.log={}", log.display());
+    workplace.succeed(&arguments("simulate", "again", &[&MAPS[..], &[&log]].concat()));
+    let again = workplace.report("again");
+    assert_eq!(again["observation_hash"], report["observation_hash"]);
+    assert_eq!(&again["traffic"]["maps"], maps);
+    // Another seed draws other maps.
+    workplace.succeed(&arguments("simulate", "other", &[&MAPS[..], &["run.seed=99"]].concat()));
+    assert_ne!(lessons_by_map(&workplace, "other", &steps), [0, 18]);
+    assert_ne!(
+        workplace.report("other")["observation_hash"],
+        report["observation_hash"]
+    );
+    workplace.assert_nothing_left();
+}
+
+/// True if a position is on a street of the generated grid: lines 300 m apart.
+fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
+    let off_m = |place_m: f32| (place_m - 300.0 * (place_m / 300.0).round()).abs();
+    off_m(x_m).min(off_m(y_m)) < 12.0
+}
+
+#[test]
+fn vehicles_are_on_the_map_that_their_tick_says() {
+    let workplace = with_city();
+    let paced = [
+        "curriculum.stages=[{cavs=12,maps=[\"town\",\"city\"]}]",
+        "episode.ticks=60",
+        "episode.training_episodes=150",
+        "run.real_time_factor=100",
+    ];
+    let mut child = workplace
+        .command(&arguments("simulate", "paced", &[&MAPS[..], &paced].concat()))
+        .spawn()
+        .unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/paced/run.json"), &mut child);
+    let observations = spectator.subscribe(Channel::Observation);
+    // Rows by map, and how many of them are on the grid.
+    let mut rows = [[0_u32; 2]; 2];
+    while child.try_wait().unwrap().is_none() {
+        let Some(message) = observations.receive().unwrap() else {
+            short_pause();
+            continue;
+        };
+        let header = message.header();
+        let layout = ObservationLayout::of(header);
+        let truth: &[[f32; 4]] = block::view(message.payload(), layout.truth).unwrap();
+        let flags: &[u32] = block::view(message.payload(), layout.flags).unwrap();
+        for ([x_m, y_m, ..], _) in truth.iter().zip(flags).filter(|(_, flags)| **flags & VALID != 0) {
+            rows[usize::from(header.map)][0] += 1;
+            rows[usize::from(header.map)][1] += u32::from(is_on_the_grid([*x_m, *y_m]));
+            assert!(
+                header.map == 1 || *x_m < 260.0 && *y_m < 260.0,
+                "{x_m} {y_m} is not in the town"
+            );
+        }
+    }
+    drop((observations, spectator));
+    assert!(child.wait().unwrap().success());
+    let [[town, by_chance], [city, on_grid]] = rows;
+    assert!(town > 500 && city > 500, "{rows:?}");
+    assert_eq!(city, on_grid);
+    assert!(by_chance < town / 2, "{rows:?}");
+    workplace.assert_nothing_left();
+}

@@ -1,0 +1,212 @@
+//! Our PPO in the driving task: whichever process is killed, replaced or stopped, the run learns the same.
+
+use std::process::{Child, Stdio};
+
+use crate::common::{Workplace, text, until};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Two worlds of four heroes each, and an update every 300 samples.
+const SMALL: [&str; 17] = [
+    "run.envs=2",
+    "traffic.heroes=4",
+    "traffic.others=3",
+    "traffic.pedestrians=2",
+    "task.time_limit_s=20",
+    "episode.ticks=220",
+    "episode.training_episodes=6",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=60",
+    "trainer.network=mlp",
+    "trainer.hidden=[16]",
+    "trainer.horizon=600",
+    "trainer.batch_size=300",
+    "trainer.checkpoint_interval=2",
+    "trainer.matmul_precision=float32",
+    "observation.fields=driving",
+    "fanout.enabled=false",
+];
+
+fn arguments<'a>(name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    ["train", "driving", "--name", name]
+        .into_iter()
+        .chain(settings)
+        .collect()
+}
+
+/// What was learnt: the newest checkpoint's name and the hash of its tensors.
+fn learnt(workplace: &Workplace, name: &str) -> String {
+    let checkpoints = workplace.path().join("runs").join(name).join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let mut hasher = blake3::Hasher::new();
+    for file in ["parameters", "optimiser", "memory"] {
+        let file = checkpoints.join(newest.trim()).join(format!("{file}.safetensors"));
+        hasher.update(&std::fs::read(file).unwrap());
+    }
+    format!("{} {}", newest.trim(), hasher.finalize().to_hex())
+}
+
+/// What a disturbed run has in common with one that was not: observations, trips, samples, evaluations, parameters.
+fn outcome(workplace: &Workplace, name: &str) -> Value {
+    let report = workplace.report(name);
+    assert_eq!(report["result"], "completed", "{name}");
+    let evaluations = report["trainer"]["evaluations"].as_array().unwrap();
+    serde_json::json!({
+        "learnt": learnt(workplace, name),
+        "hash": report["observation_hash"],
+        "env_steps": report["env_steps"],
+        "lost": [report["lost_ticks"], report["duplicated_ticks"]],
+        "heroes": report["dynamics"]["heroes"],
+        "evaluations": evaluations.iter().map(|each| each["ppo_mean_progress_mps"].clone()).collect::<Vec<_>>(),
+    })
+}
+
+fn start(workplace: &Workplace, arguments: &[&str], log: &str) -> Child {
+    let log = std::fs::File::create(workplace.path().join(log)).unwrap();
+    let command = workplace.command(arguments).stdout(Stdio::null()).stderr(log).spawn();
+    command.unwrap()
+}
+
+/// Process ids of a run's processes whose command line has `word`.
+fn processes(workplace: &Workplace, name: &str, word: &str) -> Vec<Pid> {
+    let here = workplace.path().join("runs").join(name).to_string_lossy().into_owned();
+    let entries = std::fs::read_dir("/proc").unwrap().flatten();
+    let pids = entries.filter_map(|entry| {
+        let line = std::fs::read(entry.path().join("cmdline")).ok()?;
+        let line = String::from_utf8_lossy(&line).into_owned();
+        let pid: i32 = entry.file_name().to_str()?.parse().ok()?;
+        (line.contains(word) && line.contains(&format!("{here}/")))
+            .then(|| Pid::from_raw(pid))
+            .flatten()
+    });
+    pids.collect()
+}
+
+fn wait_for_checkpoint(workplace: &Workplace, name: &str, updates: u32, run: &mut Child) {
+    let checkpoints = workplace.path().join("runs").join(name).join("checkpoints");
+    until(run, "a checkpoint", || {
+        let newest = std::fs::read_to_string(checkpoints.join("latest")).ok()?;
+        let number: u32 = newest.trim().rsplit('-').next()?.parse().ok()?;
+        (number >= updates).then_some(())
+    });
+}
+
+#[test]
+fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("whole", &[]));
+    let expected = outcome(&workplace, "whole");
+    assert_eq!(expected["lost"], serde_json::json!([0, 0]));
+    assert!(expected["evaluations"].as_array().unwrap().len() >= 2, "{expected:#}");
+    assert!(expected["heroes"]["episodes"].as_u64().unwrap() >= 8, "{expected:#}");
+
+    // The learner, twice, by SIGKILL.
+    let mut run = start(
+        &workplace,
+        &arguments("killed", &["run.real_time_factor=12"]),
+        "killed.log",
+    );
+    for updates in [2, 6] {
+        wait_for_checkpoint(&workplace, "killed", updates, &mut run);
+        let victim = until(&mut run, "a learner", || {
+            processes(&workplace, "killed", "caraware.train").pop()
+        });
+        kill_process(victim, Signal::KILL).unwrap();
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("killed.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert!(said.contains("a successor continues"), "{said}");
+    assert_eq!(outcome(&workplace, "killed"), expected);
+
+    // Each simulator once, and in the end one at the same time as the learner.
+    let mut run = start(
+        &workplace,
+        &arguments("simulated", &["run.real_time_factor=12"]),
+        "simulated.log",
+    );
+    let victims: [(u32, &[&str]); 4] = [
+        (1, &["/sim-core"]),
+        (3, &["/traffic-bridge"]),
+        (5, &["/sensor-daemon"]),
+        (7, &["/sim-core", "caraware.train"]),
+    ];
+    for (updates, words) in victims {
+        wait_for_checkpoint(&workplace, "simulated", updates, &mut run);
+        for word in words {
+            let victim = until(&mut run, "a process", || processes(&workplace, "simulated", word).pop());
+            kill_process(victim, Signal::KILL).unwrap();
+        }
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("simulated.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    let again = said.matches("the simulation is made again from tick").count();
+    assert_eq!(again, victims.len(), "{said}");
+    assert_eq!(outcome(&workplace, "simulated"), expected);
+
+    // A planned handover to a successor of the same kind.
+    let mut run = start(
+        &workplace,
+        &arguments("handed", &["run.real_time_factor=12"]),
+        "handed.log",
+    );
+    wait_for_checkpoint(&workplace, "handed", 2, &mut run);
+    workplace.succeed(&["handover", "handed"]);
+    let status = run.wait().unwrap();
+    assert!(
+        status.success(),
+        "{}",
+        std::fs::read_to_string(workplace.path().join("handed.log")).unwrap()
+    );
+    assert_eq!(outcome(&workplace, "handed"), expected);
+
+    // Stopped in its second half, then resumed.
+    let mut run = start(&workplace, &arguments("cut", &["run.real_time_factor=12"]), "cut.log");
+    wait_for_checkpoint(&workplace, "cut", 4, &mut run);
+    kill_process(Pid::from_child(&run), Signal::INT).unwrap();
+    assert_eq!(run.wait().unwrap().code(), Some(130));
+    let output = workplace.succeed(&["train", "--resume", "cut", "--set", "run.real_time_factor=0"]);
+    assert_eq!(workplace.report("cut")["result"], "completed", "{}", text(&output));
+    let resumed = outcome(&workplace, "cut");
+    for key in ["learnt", "env_steps", "lost", "evaluations"] {
+        assert_eq!(resumed[key], expected[key], "{key}");
+    }
+    workplace.assert_nothing_left();
+
+    // What was learnt is played, on other seeds.
+    workplace.succeed(&["play", "whole", "--name", "played", "--episodes", "4"]);
+    let played = workplace.report("played");
+    assert!(played["trainer"]["ppo_mean_progress_mps"].is_number(), "{played:#}");
+    assert!(
+        !played["trainer"]["trips"].as_object().unwrap().is_empty(),
+        "{played:#}"
+    );
+
+    // The same with simulators that die.
+    let paced = ["--episodes", "4", "--set", "run.real_time_factor=8"];
+    let mut run = start(
+        &workplace,
+        &[&["play", "whole", "--name", "replayed"], paced.as_slice()].concat(),
+        "replayed.log",
+    );
+    let live = workplace.path().join("runs/replayed/live.json");
+    for (episode, word) in [(0, "/sim-core"), (1, "/traffic-bridge"), (2, "/sensor-daemon")] {
+        until(&mut run, "an episode", || {
+            let live: Value = serde_json::from_str(&std::fs::read_to_string(&live).ok()?).ok()?;
+            (live["table"]["episode"].as_u64()? >= episode).then_some(())
+        });
+        let victim = until(&mut run, "a process", || processes(&workplace, "replayed", word).pop());
+        kill_process(victim, Signal::KILL).unwrap();
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("replayed.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(said.matches("the simulation is made again").count(), 3, "{said}");
+    let again = workplace.report("replayed");
+    assert_eq!(again["observation_hash"], played["observation_hash"]);
+    assert_eq!(again["trainer"]["trips"], played["trainer"]["trips"]);
+    assert_eq!(again["trainer"]["episodes"], played["trainer"]["episodes"]);
+    workplace.assert_nothing_left();
+}

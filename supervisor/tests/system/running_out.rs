@@ -1,0 +1,378 @@
+//! Whole runs that run out of shared memory, of disk space or of file handles: a clear error or a wait, never a signal or a hang.
+
+use std::{
+    fs::File,
+    os::{fd::AsRawFd as _, unix::process::ExitStatusExt as _},
+    path::{Path, PathBuf},
+    process::{Child, Command, Output, Stdio},
+};
+
+use crate::common::{Workplace, text, until, with_mounts};
+use rustix::{
+    fs::statvfs,
+    process::{Pid, Signal, kill_process},
+};
+
+/// A short training run of six vehicles, without viewers.
+const SHORT: [&str; 11] = [
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=150",
+    "episode.training_episodes=4",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=40",
+    "trainer.checkpoint_interval=1",
+    "trainer.horizon=900",
+    "trainer.batch_size=300",
+    "fanout.enabled=false",
+];
+
+fn train<'a>(name: &'a str, settings: &[&'a str]) -> Vec<&'a str> {
+    let set = SHORT.iter().chain(settings).flat_map(|setting| ["--set", *setting]);
+    ["train", "town", "--name", name].into_iter().chain(set).collect()
+}
+
+/// Process id of the process whose command line has both words.
+fn pid_of(words: [&str; 2]) -> Option<Pid> {
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    let pids = processes.filter_map(|entry| entry.file_name().to_string_lossy().parse::<i32>().ok());
+    pids.filter_map(Pid::from_raw).find(|pid| {
+        let line = std::fs::read(format!("/proc/{}/cmdline", pid.as_raw_nonzero())).unwrap_or_default();
+        let line = String::from_utf8_lossy(&line).replace('\0', " ");
+        words.iter().all(|word| line.contains(word)) && !line.contains("unshare")
+    })
+}
+
+/// Fills the file system of `directory`, as another program's file does, and returns that file.
+fn fill(directory: &Path) -> PathBuf {
+    let path = directory.join("other");
+    let file = File::create(&path).unwrap();
+    let block = vec![1_u8; 1 << 16];
+    let mut size = block.len();
+    // What is left is too little for a block: smaller ones follow.
+    while size > 0 {
+        if std::io::Write::write_all(&mut &file, &block[..size]).is_err() {
+            size /= 2;
+        }
+    }
+    path
+}
+
+fn assert_ended_clearly(output: &Output, what: &str) {
+    assert_eq!(output.status.signal(), None, "{what}: {}", text(output));
+    assert!(
+        output.status.success() || !text(output).contains("panicked"),
+        "{what}: {}",
+        text(output)
+    );
+}
+
+#[test]
+fn little_shared_memory_is_an_error_that_names_what_is_needed() {
+    let workplace = Workplace::new();
+    for mib in [1, 16, 64] {
+        let name = format!("of-{mib}");
+        let mount = format!("mount -t tmpfs -o size={mib}m none /dev/shm");
+        let Some(mut command) = with_mounts(&workplace.command(&train(&name, &[])), &mount) else {
+            return;
+        };
+        let output = command.output().unwrap();
+        assert_ended_clearly(&output, &name);
+        let said = text(&output);
+        match mib {
+            64 => assert!(output.status.success(), "{said}"),
+            mib => {
+                assert_eq!(output.status.code(), Some(3), "{said}");
+                assert!(
+                    said.contains(&format!("/dev/shm has {mib} MiB free, but this run needs")),
+                    "{said}"
+                );
+                assert!(said.contains("--shm-size"), "{said}");
+            }
+        }
+    }
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_run_keeps_the_memory_that_it_reserved_when_others_fill_the_rest() {
+    let workplace = Workplace::new();
+    let hash = |name: &str| workplace.report(name)["observation_hash"].clone();
+    workplace.succeed(&train("alone", &[]));
+    // Another program fills the memory as soon as the run has been prepared: no process has started.
+    let disturb = "mount -t tmpfs -o size=80m none /dev/shm && \
+        { (until [ -s /dev/shm/*reserve ]; do :; done; cat /dev/zero > /dev/shm/other; touch filled) > /dev/null 2>&1 & }";
+    let command = workplace.command(&train("beside", &[]));
+    let Some(mut command) = with_mounts(&command, disturb) else {
+        return;
+    };
+    let mut run = command.stderr(Stdio::piped()).spawn().unwrap();
+    // The trainer is killed while the memory is full: its successor gets what it had.
+    let checkpoint = workplace.path().join("runs/beside/checkpoints/latest");
+    until(&mut run, "checkpoint", || checkpoint.exists().then_some(()));
+    assert!(workplace.path().join("filled").exists());
+    let trainer = pid_of(["caraware.train", &workplace.path().to_string_lossy()]);
+    let killed = trainer.is_some_and(|pid| kill_process(pid, Signal::KILL).is_ok());
+    let output = run.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(hash("alone"), hash("beside"));
+    assert!(!killed || workplace.report("beside")["lost_ticks"] == 0);
+    workplace.assert_nothing_left();
+}
+
+/// A run whose files and iceoryx2's are on a small disk, which is full once the run has a checkpoint.
+struct RunOnFullDisk {
+    run: Child,
+    /// The disk, as this process sees it, also after the run's end.
+    disk: PathBuf,
+    _held: File,
+    /// The file that fills the disk.
+    filling: PathBuf,
+    /// What the run writes to its standard error.
+    said: PathBuf,
+}
+
+impl RunOnFullDisk {
+    /// `None` if this system allows no mounts.
+    fn start(workplace: &Workplace, settings: &[&str]) -> Option<Self> {
+        let small = workplace.path().join("small");
+        std::fs::create_dir(&small).unwrap();
+        let arguments = [&train("full", settings)[..], &["--runs", "small"]].concat();
+        let mount = format!("mount -t tmpfs -o size=48m none {}", small.display());
+        let mut command = workplace.command(&arguments);
+        command.env("CARAWARE_RUNTIME_DIR", small.join("r"));
+        let mut command = with_mounts(&command, &mount)?;
+        let said = workplace.path().join("said");
+        command.stderr(File::create(&said).unwrap()).stdout(Stdio::null());
+        let mut run = command.spawn().unwrap();
+        // The run's mounts are seen through its process, and through an open directory also after its end.
+        let inside = PathBuf::from(format!("/proc/{}/root{}", run.id(), small.display()));
+        until(&mut run, "checkpoint", || {
+            inside.join("full/checkpoints/latest").exists().then_some(())
+        });
+        let held = File::open(&inside).unwrap();
+        let disk = PathBuf::from(format!("/proc/self/fd/{}", held.as_raw_fd()));
+        let filling = fill(&disk);
+        Some(Self {
+            run,
+            disk,
+            _held: held,
+            filling,
+            said,
+        })
+    }
+
+    fn wait_until_it_says(&mut self, words: &str) {
+        let said = &self.said;
+        until(&mut self.run, words, || {
+            std::fs::read_to_string(said).unwrap().contains(words).then_some(())
+        });
+    }
+
+    /// Frees the disk, and waits for the run's end. Returns its report, what it said, and what its processes have logged.
+    fn finish(mut self) -> (serde_json::Value, String, String) {
+        assert!(
+            statvfs(&self.disk).unwrap().f_bavail * 4096 < 64 << 10,
+            "the disk is not full"
+        );
+        std::fs::remove_file(&self.filling).unwrap();
+        let status = self.run.wait().unwrap();
+        let said = std::fs::read_to_string(&self.said).unwrap();
+        assert!(status.success(), "{said}");
+        let report = std::fs::read_to_string(self.disk.join("full/report.json")).unwrap();
+        let logs = std::fs::read_dir(self.disk.join("full/logs")).unwrap().flatten();
+        let logs = logs.filter_map(|entry| std::fs::read_to_string(entry.path()).ok());
+        (serde_json::from_str(&report).unwrap(), said, logs.collect())
+    }
+}
+
+impl Drop for RunOnFullDisk {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("{}", std::fs::read_to_string(&self.said).unwrap_or_default());
+        }
+    }
+}
+
+#[test]
+fn a_full_disk_is_waited_for() {
+    let workplace = Workplace::new();
+    let longer = ["episode.training_episodes=10"];
+    workplace.succeed(&train("alone", &longer));
+    let reference = workplace.report("alone")["observation_hash"].clone();
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
+        return;
+    };
+    // Whichever process is the first to need space waits for it.
+    full.wait_until_it_says("is full");
+    let (report, said, logs) = full.finish();
+    assert!(said.contains("has space again"), "{said}");
+    assert!(logs.contains("there is space again"), "{logs}");
+    assert_eq!(
+        (&report["result"], &report["observation_hash"]),
+        (&"completed".into(), &reference)
+    );
+    assert_eq!((&report["lost_ticks"], &report["restarts"]), (&0.into(), &0.into()));
+    assert!(report["disk_full"].as_u64().unwrap() >= 1, "{report:#}");
+}
+
+/// What dies while the disk is full is started again, and has its part of shared memory once there is space.
+#[test]
+fn processes_that_die_while_the_disk_is_full_are_replaced() {
+    let workplace = Workplace::new();
+    let longer = ["episode.training_episodes=10"];
+    workplace.succeed(&train("alone", &longer));
+    let reference = workplace.report("alone")["observation_hash"].clone();
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
+        return;
+    };
+    full.wait_until_it_says("is full");
+    let kill = |name| {
+        let pid = pid_of([name, &workplace.path().to_string_lossy()]).unwrap();
+        kill_process(pid, Signal::KILL).unwrap();
+    };
+    kill("caraware.train");
+    full.wait_until_it_says("a successor continues");
+    kill("/sim-core");
+    full.wait_until_it_says("run.json waits until there is space");
+    let (report, said, _) = full.finish();
+    assert_eq!(
+        (&report["result"], &report["observation_hash"]),
+        (&"completed".into(), &reference),
+        "{said}"
+    );
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert!(report["restarts"].as_u64().unwrap() >= 1, "{report:#}");
+}
+
+/// The directory of a run is moved away while the run is alive: it ends with an error that names it.
+#[test]
+fn a_directory_that_vanishes_is_named() {
+    let workplace = Workplace::new();
+    let said = workplace.path().join("said");
+    let mut command = workplace.command(&train("results", &["episode.training_episodes=100000"]));
+    let mut run = command.stderr(File::create(&said).unwrap()).spawn().unwrap();
+    let begun = workplace.path().join("runs/results/learning.jsonl");
+    until(&mut run, "update", || begun.exists().then_some(()));
+    // At once, because processes write into it meanwhile.
+    std::fs::rename(
+        workplace.path().join("runs/results"),
+        workplace.path().join("elsewhere"),
+    )
+    .unwrap();
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(&said).unwrap();
+    // Lines are broken to the width of the terminal.
+    let words: Vec<&str> = said.split_whitespace().filter(|word| *word != "│").collect();
+    let words = words.join(" ");
+    assert!(words.contains("was removed while the run was alive"), "{said}");
+    assert!(status.code() == Some(1) && !said.contains("panicked"), "{said}");
+    assert!(workplace.shared_memory().is_empty(), "{:?}", workplace.shared_memory());
+}
+
+/// `command` in a shell that first runs `before`.
+fn in_shell(command: &Command, before: &str) -> Command {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", &format!("{before} && exec \"$@\""), "sh"]);
+    shell.arg(command.get_program()).args(command.get_args());
+    shell.current_dir(command.get_current_dir().unwrap());
+    shell.envs(command.get_envs().filter_map(|(key, value)| Some((key, value?))));
+    shell
+}
+
+#[test]
+fn too_few_file_handles_are_an_error_that_names_the_limit() {
+    let workplace = Workplace::new();
+    for limit in [12, 24, 48, 64, 96, 128, 192, 256] {
+        let command = workplace.command(&train("handles", &[]));
+        let output = in_shell(&command, &format!("ulimit -n {limit}")).output().unwrap();
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(3), "{limit}: {said}");
+        assert!(
+            said.contains(&format!("a process may open {limit} files")),
+            "{limit}: {said}"
+        );
+        assert!(said.contains("`ulimit -n 320`"), "{limit}: {said}");
+    }
+    assert!(!workplace.path().join("runs").exists());
+    // What is asked for is enough, and a limit that the user may raise is raised.
+    for (name, before) in [("hard", "ulimit -n 320"), ("soft", "ulimit -S -n 64")] {
+        let output = in_shell(&workplace.command(&train(name, &[])), before)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{before}: {}", text(&output));
+    }
+    workplace.assert_nothing_left();
+}
+
+/// A control group with a limit on memory. Dropping it removes it.
+struct LimitedGroup(PathBuf);
+
+impl LimitedGroup {
+    /// A group of either version; `None` if this user may not create one.
+    fn new(limit_mib: u64) -> Option<Self> {
+        let name = format!("caraware-test-{}", std::process::id());
+        let version_1 = (
+            "/sys/fs/cgroup/memory",
+            "memory.limit_in_bytes",
+            "memory.memsw.limit_in_bytes",
+        );
+        let version_2 = ("/sys/fs/cgroup", "memory.max", "memory.swap.max");
+        [version_1, version_2].into_iter().find_map(|(parent, limit, swap)| {
+            let group = Self(Path::new(parent).join(&name));
+            std::fs::create_dir(&group.0).ok()?;
+            // Below a directory that is no control group no such file appears.
+            let limit = group.0.join(limit);
+            let limited = limit.exists() && std::fs::write(&limit, (limit_mib << 20).to_string()).is_ok();
+            let swap = group.0.join(swap);
+            if swap.exists() {
+                let most = if swap.ends_with("memory.swap.max") {
+                    0
+                } else {
+                    limit_mib << 20
+                };
+                std::fs::write(&swap, most.to_string()).ok()?;
+            }
+            limited.then_some(group)
+        })
+    }
+}
+
+impl Drop for LimitedGroup {
+    fn drop(&mut self) {
+        // A group whose processes have just ended may need a moment.
+        for _ in 0..100 {
+            if std::fs::remove_dir(&self.0).is_ok() {
+                return;
+            }
+            std::thread::park_timeout(std::time::Duration::from_millis(50));
+        }
+    }
+}
+
+/// The kernel kills a trainer that needs more than the group's limit: the run ends with a report that says so.
+#[test]
+fn a_limit_on_memory_that_the_kernel_enforces_is_named() {
+    const LIMIT_MIB: u64 = 300;
+    let workplace = Workplace::new();
+    let Some(group) = LimitedGroup::new(LIMIT_MIB) else {
+        eprintln!("not tested: this user may not create a control group with a limit on memory");
+        return;
+    };
+    let join = format!("echo $$ > {}/cgroup.procs", group.0.display());
+    let output = in_shell(&workplace.command(&train("limited", &[])), &join)
+        .output()
+        .unwrap();
+    assert_ended_clearly(&output, "limited");
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+    let report = workplace.report("limited");
+    assert_eq!(report["result"], "failed", "{report:#}");
+    let message = report["failure"]["message"].as_str().unwrap();
+    let named = format!("the kernel has ended trainer: the limit on memory of {LIMIT_MIB} MiB was reached");
+    assert!(message.contains(&named), "{message}");
+    workplace.assert_nothing_left();
+}

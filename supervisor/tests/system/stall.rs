@@ -1,0 +1,220 @@
+//! A process that hangs is named, and replaced if the configuration says so; one that waits in order is not.
+
+use std::{
+    path::Path,
+    process::{Child, Stdio},
+    time::{Duration, Instant},
+};
+
+use crate::common::{Spectator, Workplace, text, until};
+use ipc_schema::process::Process;
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Six vehicles, 2 100 ticks with an evaluation in the middle, a checkpoint for every update.
+const SMALL: [&str; 13] = [
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=300",
+    "episode.training_episodes=6",
+    "episode.evaluation_interval=3",
+    "episode.evaluation_ticks=100",
+    "episode.final_evaluations=1",
+    "trainer.horizon=600",
+    "trainer.batch_size=300",
+    "trainer.checkpoint_interval=1",
+    "trainer.matmul_precision=float32",
+    "fanout.enabled=false",
+];
+/// A pace that leaves time to stop processes: 10 s for the run.
+const PACED: &str = "run.real_time_factor=20";
+
+fn arguments<'a>(name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    ["train", "town", "--name", name].into_iter().chain(settings).collect()
+}
+
+/// A run in the background.
+struct Run {
+    child: Child,
+    said: std::path::PathBuf,
+    run_dir: std::path::PathBuf,
+    boards: Spectator,
+}
+
+impl Run {
+    fn start(workplace: &Workplace, name: &str, more: &[&str]) -> Self {
+        let said = workplace.path().join("said");
+        let log = std::fs::File::create(&said).unwrap();
+        let mut command = workplace.command(&arguments(name, more));
+        let mut child = command.stdout(Stdio::null()).stderr(log).spawn().unwrap();
+        let run_dir = workplace.path().join("runs").join(name);
+        let boards = Spectator::join(&run_dir.join("run.json"), &mut child);
+        Self {
+            child,
+            said,
+            run_dir,
+            boards,
+        }
+    }
+
+    fn until_said(&mut self, words: &str) {
+        let said = self.said.clone();
+        until(&mut self.child, words, || {
+            std::fs::read_to_string(&said).unwrap().contains(words).then_some(())
+        });
+    }
+
+    /// Waits until the trainer has consumed `more` ticks.
+    fn until_consumed(&mut self, more: u64) {
+        let board = self.boards.board(Process::Trainer);
+        let consumed = || Some(board.progress()).filter(|progress| progress.attached == 1);
+        let first = until(&mut self.child, "a trainer", consumed).consumed_ticks;
+        until(&mut self.child, "ticks", || {
+            consumed()
+                .filter(|progress| progress.consumed_ticks >= first + more)
+                .map(drop)
+        });
+    }
+
+    fn pid_of(&self, process: Process) -> Option<Pid> {
+        let run_file = self.run_dir.join("run.json").to_string_lossy().into_owned();
+        let mut entries = std::fs::read_dir("/proc").unwrap().flatten();
+        entries.find_map(|entry| {
+            let line = std::fs::read(entry.path().join("cmdline")).ok()?;
+            let line = String::from_utf8_lossy(&line).into_owned();
+            let program = match process {
+                Process::Trainer => line.contains("\0caraware.train\0"),
+                process => Path::new(line.split('\0').next()?).ends_with(process.name()),
+            };
+            let pid: i32 = entry.file_name().to_str()?.parse().ok()?;
+            (program && line.contains(&run_file))
+                .then(|| Pid::from_raw(pid))
+                .flatten()
+        })
+    }
+
+    fn end(mut self) -> String {
+        drop(self.boards);
+        let status = self.child.wait().unwrap();
+        let said = std::fs::read_to_string(&self.said).unwrap();
+        assert!(status.success(), "{status}\n{said}");
+        said
+    }
+}
+
+/// Bytes of what was learnt.
+fn parameters(workplace: &Workplace, name: &str) -> Vec<u8> {
+    let checkpoints = workplace.path().join("runs").join(name).join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let files = ["parameters", "optimiser", "random"].map(|name| format!("{name}.safetensors"));
+    let read = |file: &String| std::fs::read(checkpoints.join(newest.trim()).join(file)).unwrap();
+    files.iter().flat_map(read).collect()
+}
+
+fn assert_same(workplace: &Workplace, names: [&str; 2], restarts: u64) {
+    let [whole, disturbed] = names.map(|name| workplace.report(name));
+    for key in ["result", "observation_hash", "vehicle_steps", "ticks", "env_steps"] {
+        assert_eq!(whole[key], disturbed[key], "{key}");
+    }
+    for (key, expected) in [("lost_ticks", 0), ("duplicated_ticks", 0), ("restarts", restarts)] {
+        assert_eq!(disturbed[key], Value::from(expected), "{key}");
+    }
+    let [whole, disturbed] = names.map(|name| parameters(workplace, name));
+    assert_eq!(whole, disturbed);
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn each_process_that_is_stopped_is_named_and_replaced_and_nothing_changes() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("whole", &[]));
+    let replace = ["run.stall_s=5", "run.on_stall=replace", PACED];
+    let mut run = Run::start(&workplace, "stopped", &replace);
+    let processes = [
+        Process::TrafficBridge,
+        Process::SimCore,
+        Process::SensorDaemon,
+        Process::Trainer,
+    ];
+    for process in processes {
+        run.until_consumed(100);
+        let pid = run.pid_of(process).unwrap();
+        kill_process(pid, Signal::STOP).unwrap();
+        run.until_said(&format!(
+            "{process} has made no progress for 5 s: a signal or a debugger has stopped it"
+        ));
+        let gone = format!("/proc/{}", pid.as_raw_nonzero());
+        until(&mut run.child, "its end", || (!Path::new(&gone).exists()).then_some(()));
+    }
+    let log = std::fs::read_to_string(run.run_dir.join("logs/sim-core.log")).unwrap();
+    assert!(log.contains("caraware: sim-core has made no progress for 5 s"), "{log}");
+    let said = run.end();
+    // The other processes wait meanwhile, and are not named.
+    let named = said.lines().filter(|line| line.contains("; it is killed")).count();
+    assert_eq!(named, processes.len(), "{said}");
+    assert_same(&workplace, ["whole", "stopped"], 4);
+}
+
+#[test]
+fn a_stall_is_reported_and_a_pause_or_a_stopped_supervisor_is_none() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("whole", &[]));
+    let mut run = Run::start(&workplace, "stopped", &["run.stall_s=4", PACED]);
+    run.until_consumed(100);
+    // A stopped process is named by `ps`, beside those that wait for it, until it continues.
+    let core = run.pid_of(Process::SimCore).unwrap();
+    kill_process(core, Signal::STOP).unwrap();
+    run.until_said("sim-core has made no progress for 4 s");
+    // The others note every look, and what they look for; between two looks they show nothing for a moment.
+    until(&mut run.child, "a table of what waits for what", || {
+        let table = text(&workplace.succeed(&["ps", "stopped"]));
+        let row = |process: &str| {
+            table
+                .lines()
+                .find(|line| line.split_whitespace().nth(1) == Some(process))
+                .unwrap()
+                .trim()
+                .to_owned()
+        };
+        let [core, sensing, trainer] = ["sim-core", "sensor-daemon", "trainer"].map(row);
+        assert!(core.contains(" stalled "), "{table}");
+        assert!(!sensing.contains("stalled") && !trainer.contains("stalled"), "{table}");
+        (sensing.ends_with(" sim-core") && trainer.ends_with(" sensor-daemon")).then_some(())
+    });
+    kill_process(core, Signal::CONT).unwrap();
+    run.until_said("sim-core continues");
+
+    // In a pause every process waits in order.
+    workplace.succeed(&["control", "pause"]);
+    wait_beyond_the_limit();
+    workplace.succeed(&["control", "resume"]);
+    run.until_consumed(100);
+
+    // While the supervisor is stopped, too, no time counts.
+    let supervisor = Pid::from_child(&run.child);
+    for pid in [core, supervisor] {
+        kill_process(pid, Signal::STOP).unwrap();
+    }
+    wait_beyond_the_limit();
+    for pid in [supervisor, core] {
+        kill_process(pid, Signal::CONT).unwrap();
+    }
+    let said = run.end();
+    assert_eq!(
+        said.matches(": a signal or a debugger has stopped it").count(),
+        1,
+        "{said}"
+    );
+    assert!(!said.contains("it is killed"), "{said}");
+    assert_same(&workplace, ["whole", "stopped"], 0);
+}
+
+/// Lets more time pass than a stall takes: what must not happen has then had its time.
+fn wait_beyond_the_limit() {
+    let end = Instant::now() + Duration::from_secs(6);
+    while Instant::now() < end {
+        std::thread::park_timeout(end - Instant::now());
+    }
+}
