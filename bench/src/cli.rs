@@ -77,9 +77,9 @@ pub struct BenchArgs {
     /// Measure only a small case: tests that the benchmark works, not how fast caraware is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
-    /// Time for which `endurance` disturbs runs, and `soak` watches one, minutes; `endurance` completes the last run
+    /// Time for which `endurance` disturbs runs, `soak` watches one, and `watch` compares segments, minutes; `endurance` completes the last run
     #[arg(long, value_name = "MINUTES", default_value_t = 10)]
-    pub minutes: u64,
+    pub minutes: u32,
     /// Seed of the moments and kinds of `endurance`'s disturbances
     #[arg(long, value_name = "SEED", default_value_t = 1)]
     pub seed: u64,

@@ -58,7 +58,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     for case in &cases {
         undisturbed.push(Outcome::of_undisturbed(&place, case)?);
     }
-    let time = Duration::from_secs(60 * options.minutes);
+    let time = Duration::from_secs(60 * u64::from(options.minutes));
     let mut random = fastrand::Rng::with_seed(options.seed);
     let begun = Instant::now();
     for round in 0.. {

@@ -43,7 +43,7 @@ pub struct BenchOptions {
     /// True if only a small case is measured, whose figures are not kept.
     pub quick: bool,
     /// Time for which runs are disturbed or watched, minutes.
-    pub minutes: u64,
+    pub minutes: u32,
     /// Seed of the disturbances.
     pub seed: u64,
     /// The policy whose driving is measured.

@@ -50,7 +50,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let (time, interval, handover_interval) = match options.quick {
         true => (Duration::from_secs(30), Duration::from_secs(1), Duration::from_secs(12)),
         false => (
-            Duration::from_secs(60 * options.minutes),
+            Duration::from_secs(60 * u64::from(options.minutes)),
             Duration::from_secs(10),
             Duration::from_secs(300),
         ),

@@ -29,8 +29,8 @@ const CORES: usize = 5;
 /// How much is measured.
 struct WatchSize {
     vehicles: u32,
-    /// Blocks of one watched segment and two without a recorder, in random order.
-    blocks: usize,
+    /// Time for blocks of one watched segment and two without a recorder, in random order; there are two blocks at least.
+    time: Duration,
     /// Time between a change and the segment.
     settling: Duration,
     segment: Duration,
@@ -38,13 +38,13 @@ struct WatchSize {
 
 const SIZE: WatchSize = WatchSize {
     vehicles: 1000,
-    blocks: 28,
+    time: Duration::from_secs(60),
     settling: Duration::from_millis(300),
     segment: Duration::from_millis(2000),
 };
 const QUICK: WatchSize = WatchSize {
     vehicles: 60,
-    blocks: 2,
+    time: Duration::ZERO,
     settling: Duration::from_millis(50),
     segment: Duration::from_millis(300),
 };
@@ -70,12 +70,21 @@ struct SegmentCost {
 /// # Errors
 /// The run cannot be started, or ends by itself.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
-    let size = if options.quick { QUICK } else { SIZE };
+    let size = if options.quick {
+        QUICK
+    } else {
+        WatchSize {
+            time: SIZE.time * options.minutes,
+            ..SIZE
+        }
+    };
     let place = BenchDirectory::new("watch")?;
     let mut run = WatchedRun::start(options, &size, &place)?;
     let mut random = fastrand::Rng::with_seed(options.seed);
     let mut ratios = SegmentRatios::default();
-    for _ in 0..size.blocks {
+    let (begin, mut blocks) = (Instant::now(), 0);
+    while blocks < 2 || begin.elapsed() < size.time {
+        blocks += 1;
         let mut order = [Segment::Alone(0), Segment::Alone(1), Segment::Watched];
         random.shuffle(&mut order);
         let (mut alone, mut watched) = ([None; 2], None);
@@ -116,7 +125,7 @@ fn report(
              order of the ratios alone. Processor time is that of `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorder received {:.0} \
              MB/s and missed {missed:.0} ticks. Load of the machine at the end: {load}.",
             size.vehicles,
-            size.blocks,
+            ratios.wall.len(),
             size.segment.as_secs_f64(),
             message_mb_per_s,
         ),
