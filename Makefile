@@ -104,9 +104,10 @@ install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/
 image: ## a container image of Containerfile, by podman, buildah or docker
 	scripts/image.sh caraware GPU=$(GPU)
 
-# A test thread more than cores: most tests start whole runs, which wait for each other much of the time.
-test-rust:
-	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} cargo test $(CARGO_FLAGS) --no-fail-fast
+# A test thread more than cores: most tests start whole runs, which wait for each other much of the time. No crate has documentation
+# tests. Cargo is no make: without MAKEFLAGS it does not look for a job server.
+test-rust: programs-and-tests
+	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} MAKEFLAGS= cargo test $(CARGO_FLAGS) --no-fail-fast --tests
 
 # One pytest each: test modules of different packages may share names.
 test-python:
