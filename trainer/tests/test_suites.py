@@ -6,6 +6,7 @@ Each export is opened by the format's own reader, and its values are compared wi
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 import yaml
 from caraware.data import Recording, open_recording
 from caraware.data.export.__main__ import export
+from caraware.data.export.nuscenes import sensor_channel
 from caraware.data.export.opv2v import world_from_pose
 from caraware.data.export.sensors import SensorLabels
 from caraware.data.recording import Array
@@ -127,6 +129,8 @@ class RecordedSample:
     """f64 [count, 3]: points or detections in the sensor's frame, x forward."""
     planes: dict[str, Any]
     """Of an image."""
+    time_s: float
+    """Simulated, since the start of the episode, at the end of the tick."""
 
     @property
     def world_m(self) -> Float64Array:
@@ -171,7 +175,7 @@ def samples(recording: Recording) -> Samples:
         else:
             planes = split_planes(head, message.section("planes").tobytes())
         key = int(head["vehicle"]), names.of(kind, head).sensor, message.tick
-        found[key] = RecordedSample(head, rows, own_m, planes)
+        found[key] = RecordedSample(head, rows, own_m, planes, float(message.header["sim_time_ns"]) * 1e-9)
     # Each sensor of both carriers has delivered.
     carriers = {carrier for carrier, _, _ in found}
     assert ROADSIDE in carriers and len(carriers) >= 2
@@ -537,9 +541,17 @@ def test_pyarrow_reads_a_row_for_each_radar_detection(run_dir: Path, samples: Sa
         rows = (columns["tick"] == tick) & (columns["carrier"] == of) & (columns["radar"] == sensor)
         world_m = np.stack([columns[name][rows] for name in ("x_m", "y_m", "z_m")], 1)
         np.testing.assert_allclose(world_m, sample.world_m, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(columns["time_s"][rows], sample.time_s, rtol=0, atol=1e-9)
         for name in ("distance_m", "azimuth_rad", "radial_velocity_mps", "rcs_dbsm", "snr_db", "object_id"):
             assert np.array_equal(columns[name][rows], sample.rows[name]), name
         assert np.array_equal(columns["is_road_user"][rows], sample.rows["object_id"] < 1 << 30)
+
+
+def test_the_suite_of_nuscenes_has_its_channels() -> None:
+    with (Path(__file__).parents[2] / "configs" / "suites" / "nuscenes.toml").open("rb") as file:
+        sensors = tomllib.load(file)["suite"][0]["sensor"]
+    assert len(sensors) == 12
+    assert [sensor_channel(sensor["kind"], sensor["name"]) for sensor in sensors] == [one["name"] for one in sensors]
 
 
 def test_sensors_of_one_carrier_have_different_labels() -> None:

@@ -111,14 +111,14 @@ def _rms_code(deviation: Float64Array) -> Array:
     return codes
 
 
-def _table(frame: Frame, radar: RadarSample, recording: Recording, users: RoadUsers) -> pa.Table:
+def _table(frame: Frame, radar: RadarSample, users: RoadUsers) -> pa.Table:
     detections, mounted, count = radar.detections, radar.mounted, len(radar.detections)
     in_world = np.c_[radar.position_m, np.ones(count)] @ radar.world_from_sensor.T
     ids = {int(state["vehicle"]): users.of(state["id_hash"]).id for state in frame.states}
     object_id = detections["object_id"].astype(np.int64)
     columns = {
         "tick": pa.array(np.full(count, frame.tick, np.int64)),
-        "time_s": pa.array(np.full(count, frame.tick * recording.tick_s)),
+        "time_s": pa.array(np.full(count, float(radar.message.header["sim_time_ns"]) * 1e-9)),
         **{
             name: pa.array([text] * count, pa.string())
             for name, text in (
@@ -157,7 +157,7 @@ def write_radar(recording: Recording, episode: Episode, path: Path) -> None:
     users, writer = RoadUsers(recording), None
     waiting: list[pa.Table] = []
     for frame in frames(recording, episode, delivered_sensors(recording, episode)):
-        waiting += [_table(frame, radar, recording, users) for radar in frame.radars]
+        waiting += [_table(frame, radar, users) for radar in frame.radars]
         if waiting and writer is None:
             schema = waiting[0].schema.with_metadata(source(recording, episode))
             writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd")
