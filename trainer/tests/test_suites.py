@@ -71,6 +71,7 @@ mount = [1.4, -0.35, 1.5, 0.0, 0.1, -0.3]
 width = 120
 height = 60
 rgb = true
+period_ticks = 2
 
 [[suite.sensor]]
 kind = "radar"
@@ -244,7 +245,7 @@ def intrinsic(width: int, height: int) -> Float64Array:
 
 def test_kitti_has_both_cameras_with_their_mounts_and_the_mast(run_dir: Path, samples: Samples, tmp_path: Path) -> None:
     _, left_out = exported(run_dir, "kitti", tmp_path)
-    assert [line.split(": ")[0] for line in left_out if "no place" in line or "one LIDAR" in line] == [
+    assert [line.split(": ")[0] for line in left_out if "no place" in line or "place for one" in line] == [
         "LIDAR `side` of suite `pair`",
         "radar `RADAR_FRONT` of suite `pair`",
         "radar `back left` of suite `pair`",
@@ -275,6 +276,11 @@ def test_kitti_has_both_cameras_with_their_mounts_and_the_mast(run_dir: Path, sa
             assert np.array_equal(points[:, :3], sample.own_m.astype("<f4"))
             image = np.asarray(Image.open(training / "image_3" / f"{name}.png"))
             assert np.array_equal(image, samples[number, "image_3", int(name)].planes["rgb"])
+    # A scan without all images of its tick is no frame, and is counted.
+    written = sum(len(list((carrier / "training" / "calib").iterdir())) for carrier in carriers)
+    missing = sum(name == "top" for _, name, _ in samples) - written
+    (line,) = (line for line in left_out if line.startswith("LIDAR `top`"))
+    assert missing >= 30 and f": a frame needs a scan and all images of its tick ({missing} messages of" in line
     # The unit of the mast stands still, and looks where the mast does: counter-clockwise from east.
     packets = {file.read_text() for file in (carriers[-1] / "training" / "oxts").iterdir()}
     (packet,) = packets

@@ -11,7 +11,7 @@ import pyarrow.parquet
 from caraware.data.export.card import source
 from caraware.data.export.frames import DeliveredSensors, Frame, RadarSample, delivered_sensors, frames
 from caraware.data.export.scans import require_channels
-from caraware.data.export.sensors import carrier_name
+from caraware.data.export.sensors import Omission, carrier_name, left_out
 from caraware.data.names import RoadUsers
 from caraware.data.recording import Array, Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -171,6 +171,7 @@ def write_radar(recording: Recording, episode: Episode, path: Path) -> None:
     writer.close()
 
 
-def lacks(delivered: DeliveredSensors, carrier: int) -> dict[tuple[str, int], str]:
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
     """The table has radars alone."""
-    return {key: "this table has radar detections alone" for key in delivered.of[carrier] if key[0] != "radar"}
+    others = [key for key in delivered.of[carrier] if key[0] != "radar"]
+    return left_out(delivered, carrier, others, "this table has radar detections alone")

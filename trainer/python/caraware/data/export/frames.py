@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -191,6 +191,8 @@ class DeliveredSensors:
     """By carrier and tick."""
     of: dict[int, dict[SensorKey, SensorFacts]] = field(default_factory=dict)
     """By carrier."""
+    combinations: dict[int, Counter[frozenset[SensorKey]]] = field(default_factory=dict)
+    """Of each carrier: ticks by the sensors that have delivered, as far as `settle` has counted them."""
 
     def main_lidar(self, carrier: int) -> SensorKey | None:
         """The main LIDAR of a carrier; None if it has none."""
@@ -202,6 +204,17 @@ class DeliveredSensors:
         """The cameras of a carrier by number, the main one first."""
         cameras = sorted(key for key in self.of[carrier] if key[0] == "camera")
         return sorted(cameras, key=lambda key: self.of[carrier][key].mounted.sensor not in MAIN_CAMERAS)
+
+    def settle(self) -> None:
+        """Count the ticks, and forget them one by one."""
+        for (carrier, _), keys in self.at.items():
+            self.combinations.setdefault(carrier, Counter())[frozenset(keys)] += 1
+        self.at.clear()
+
+    def ticks_with(self, carrier: int, keys: Iterable[SensorKey]) -> int:
+        """Settled ticks in which all these sensors of a carrier have delivered."""
+        wanted = frozenset(keys)
+        return sum(count for found, count in self.combinations[carrier].items() if wanted <= found)
 
     def add(self, sensor: SensorMessage) -> None:
         """Note a message."""

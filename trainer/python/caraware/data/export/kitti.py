@@ -37,7 +37,7 @@ from caraware.data.export.scans import (
     upright_pose,
     vehicle_pose,
 )
-from caraware.data.export.sensors import carrier_name, lack_colours
+from caraware.data.export.sensors import Omission, carrier_name, lack_colours, left_out, left_out_without
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -79,20 +79,22 @@ def _exported_cameras(delivered: DeliveredSensors, carrier: int) -> list[SensorK
     return [key for place, key in enumerate(cameras) if place in places]
 
 
-def lacks(delivered: DeliveredSensors, carrier: int) -> dict[SensorKey, str]:
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
     """KITTI has a place for one LIDAR and four cameras of a carrier, and for the colours of images."""
     main, cameras = delivered.main_lidar(carrier), _exported_cameras(delivered, carrier)
     if main is None:
-        return dict.fromkeys(delivered.of[carrier], "its carrier has no LIDAR, which a frame needs")
-    lacking = lack_colours(delivered, carrier)
-    for key in delivered.of[carrier]:
-        if key[0] == "radar":
-            lacking[key] = "KITTI has no place for radars"
-        elif key[0] == "lidar" and key != main:
-            lacking[key] = "KITTI has a place for one LIDAR, which is the main one of its carrier"
-        elif key[0] == "camera" and key not in cameras:
-            lacking[key] = "KITTI has a place for four cameras"
-    return lacking
+        return left_out(delivered, carrier, delivered.of[carrier], "its carrier has no LIDAR, which a frame needs")
+    others = {kind: [key for key in delivered.of[carrier] if key[0] == kind] for kind in ("lidar", "camera", "radar")}
+    lidars, more = ([key for key in others[kind] if key not in (main, *cameras)] for kind in ("lidar", "camera"))
+    return [
+        *(one for one in lack_colours(delivered, carrier) if one.sensor in cameras),
+        *left_out(delivered, carrier, lidars, "KITTI has a place for one LIDAR, which is the main one of its carrier"),
+        *left_out(delivered, carrier, more, "KITTI has a place for four cameras"),
+        *left_out(delivered, carrier, others["radar"], "KITTI has no place for radars"),
+        *left_out_without(
+            delivered, carrier, [main, *cameras], [main, *cameras], "a frame needs a scan and all images of its tick"
+        ),
+    ]
 
 
 @dataclass(frozen=True)

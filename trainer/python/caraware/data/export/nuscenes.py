@@ -44,7 +44,7 @@ from caraware.data.export.scans import (
     upright_pose,
     vehicle_pose,
 )
-from caraware.data.export.sensors import SensorLabels, carrier_name, lack_colours
+from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours, left_out
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -343,10 +343,19 @@ def _world_from(sensor: SensorMessage) -> Float64Array:
     return sensor.world_from_sensor
 
 
-def lacks(delivered: DeliveredSensors, carrier: int) -> dict[SensorKey, str]:
-    """A scene needs a LIDAR; images have colours alone."""
-    if delivered.main_lidar(carrier) is None:
-        return dict.fromkeys(delivered.of[carrier], "its carrier has no LIDAR, which a scene needs")
+def _coloured(delivered: DeliveredSensors, carrier: int) -> frozenset[SensorKey]:
+    """The cameras of a carrier whose images have colours."""
+    return frozenset(key for key in delivered.cameras(carrier) if "rgb" in delivered.of[carrier][key].planes)
+
+
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """A scene needs a LIDAR and a key frame; images have colours alone."""
+    main, sensors = delivered.main_lidar(carrier), delivered.of[carrier]
+    if main is None:
+        return left_out(delivered, carrier, sensors, "its carrier has no LIDAR, which a scene needs")
+    if delivered.ticks_with(carrier, {main} | _coloured(delivered, carrier)) == 0:
+        reason = "its carrier has no tick with a scan of the main LIDAR and all images, which a key frame needs"
+        return left_out(delivered, carrier, sensors, reason)
     return lack_colours(delivered, carrier)
 
 
@@ -365,7 +374,7 @@ def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
             continue
         if carrier not in scenes:
             name = f"scene-{episode.number:05}-{carrier_name(carrier).removeprefix('vehicle_')}"
-            cameras = frozenset(key for key in delivered.cameras(carrier) if "rgb" in delivered.of[carrier][key].planes)
+            cameras = _coloured(delivered, carrier)
             scenes[carrier] = _Scene(name, run, path, log, recording.tick_s, cameras, labels, users)
         scenes[carrier].add(frame)
     if not scenes:

@@ -19,12 +19,11 @@ from caraware.data.export.frames import (
     DeliveredSensors,
     Frame,
     LidarScan,
-    SensorKey,
     delivered_sensors,
     frames,
 )
 from caraware.data.export.scans import box_middle, projection, require_channels
-from caraware.data.export.sensors import lack_colours
+from caraware.data.export.sensors import Omission, lack_colours, left_out, left_out_without
 from caraware.data.recording import Array, Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array, FloatArray
 from caraware.ipc.mounts import ROADSIDE
@@ -45,14 +44,20 @@ def agent_number(carrier: int) -> int:
     return -1 - (carrier & ~ROADSIDE) if carrier & ROADSIDE else carrier
 
 
-def lacks(delivered: DeliveredSensors, carrier: int) -> dict[SensorKey, str]:
-    """OPV2V has a place for points and for the colours of four cameras."""
-    if delivered.main_lidar(carrier) is None:
-        return dict.fromkeys(delivered.of[carrier], "its carrier has no LIDAR, which an agent needs")
-    lacking = lack_colours(delivered, carrier)
-    lacking |= dict.fromkeys(delivered.cameras(carrier)[MOST_CAMERAS:], "OPV2V has a place for four cameras")
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """OPV2V has a place for points and for the colours of four cameras, at ticks with a scan of the main LIDAR."""
+    main = delivered.main_lidar(carrier)
+    if main is None:
+        return left_out(delivered, carrier, delivered.of[carrier], "its carrier has no LIDAR, which an agent needs")
+    cameras = delivered.cameras(carrier)
+    kept = [*cameras[:MOST_CAMERAS], *(key for key in delivered.of[carrier] if key[0] == "lidar")]
     radars = [key for key in delivered.of[carrier] if key[0] == "radar"]
-    return lacking | dict.fromkeys(radars, "OPV2V has no place for radars")
+    return [
+        *(one for one in lack_colours(delivered, carrier) if one.sensor in kept),
+        *left_out(delivered, carrier, cameras[MOST_CAMERAS:], "OPV2V has a place for four cameras"),
+        *left_out(delivered, carrier, radars, "OPV2V has no place for radars"),
+        *left_out_without(delivered, carrier, kept, [main], "a tick needs a scan of the main LIDAR"),
+    ]
 
 
 def pose(position_m: Any, attitude_rad: Any) -> list[float]:

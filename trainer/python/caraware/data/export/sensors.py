@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from caraware.data.export.frames import CHANNELS, DeliveredSensors, SensorKey, sensor_messages
 from caraware.data.recording import Recording
@@ -11,8 +11,18 @@ from caraware.ipc.image import ImageShape
 from caraware.ipc.mounts import OWN_SENSOR, ROADSIDE
 from caraware.ipc.run_file import RunFile
 
-Lacks = Callable[[DeliveredSensors, int], dict[SensorKey, str]]
-"""The sensors of a carrier that a format has no place for, or only a part of, and why."""
+
+class Omission(NamedTuple):
+    """What a format leaves out of a sensor of a carrier."""
+
+    sensor: SensorKey
+    reason: str
+    messages: int
+    """How many of its messages are concerned."""
+
+
+Lacks = Callable[[DeliveredSensors, int], list[Omission]]
+"""What a format leaves out of the sensors of a carrier, from the settled ticks of an episode."""
 
 
 def carrier_name(carrier: int) -> str:
@@ -44,21 +54,38 @@ class SensorLabels:
         return self._labels.get(key) or self._label(key[0], key[0])
 
 
+def left_out(delivered: DeliveredSensors, carrier: int, sensors: Iterable[SensorKey], reason: str) -> list[Omission]:
+    """All messages of these sensors of a carrier are left out."""
+    return [Omission(key, reason, delivered.ticks_with(carrier, [key])) for key in sensors]
+
+
+def left_out_without(
+    delivered: DeliveredSensors, carrier: int, sensors: Iterable[SensorKey], needed: Iterable[SensorKey], reason: str
+) -> list[Omission]:
+    """Messages of these sensors are left out at ticks at which one of those that are needed has not delivered."""
+    needed = frozenset(needed)
+    without = (
+        (key, delivered.ticks_with(carrier, [key]) - delivered.ticks_with(carrier, {key} | needed)) for key in sensors
+    )
+    return [Omission(key, reason, count) for key, count in without if count]
+
+
 def all_lack(reason: str) -> Lacks:
     """For a format that has no place for any sensor that sends messages of its own."""
-    return lambda delivered, carrier: dict.fromkeys(delivered.of[carrier], reason)
+    return lambda delivered, carrier: left_out(delivered, carrier, delivered.of[carrier], reason)
 
 
-def lack_colours(delivered: DeliveredSensors, carrier: int) -> dict[SensorKey, str]:
+def lack_colours(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
     """For a format with the colours of images: cameras that have none, and the other planes."""
-    lacking = {}
+    found = []
     for key in delivered.cameras(carrier):
-        others = [plane for plane in delivered.of[carrier][key].planes if plane != "rgb"]
-        if "rgb" not in delivered.of[carrier][key].planes:
-            lacking[key] = "its images have no colours (`camera.rgb`)"
+        planes = delivered.of[carrier][key].planes
+        others = [plane for plane in planes if plane != "rgb"]
+        if "rgb" not in planes:
+            found += left_out(delivered, carrier, [key], "its images have no colours (`camera.rgb`)")
         elif others:
-            lacking[key] = f"of its images only the colours, not {', '.join(others)}"
-    return lacking
+            found += left_out(delivered, carrier, [key], f"of its images only the colours, not {', '.join(others)}")
+    return found
 
 
 def omissions(recording: Recording, lacks: Lacks, *, has_observations: bool = False) -> list[str]:
@@ -67,26 +94,26 @@ def omissions(recording: Recording, lacks: Lacks, *, has_observations: bool = Fa
     `has_observations` says that the format has observations, but not the images that may stand in them.
     """
     by_episode: dict[int, DeliveredSensors] = {}
-    messages: dict[tuple[int, int, SensorKey], int] = {}
+    newest = -1
     for sensor, message in sensor_messages(recording):
         if sensor is not None:
             episode = int(message.header["episode"])
-            delivered = by_episode.setdefault(episode, DeliveredSensors())
-            delivered.add(sensor)
-            delivered.at.clear()
-            of = (episode, int(sensor.head["vehicle"]), sensor.key)
-            messages[of] = messages.get(of, 0) + 1
+            if episode > newest:
+                # Ticks of an episode may be recorded after the first of the next one, those of the one before may not.
+                for number in [number for number in by_episode if number < newest]:
+                    by_episode[number].settle()
+                newest = episode
+            by_episode.setdefault(episode, DeliveredSensors()).add(sensor)
     # Carriers and messages by sensor and reason.
     lacking: dict[tuple[str, str], tuple[set[str], int]] = {}
-    for episode, delivered in by_episode.items():
+    for delivered in by_episode.values():
+        delivered.settle()
         for carrier in delivered.of:
-            for key, reason in lacks(delivered, carrier).items():
-                mounted = delivered.of[carrier][key].mounted
-                carriers, count = lacking.get((_called(key[0], mounted.sensor, mounted.suite), reason), (set(), 0))
-                lacking[_called(key[0], mounted.sensor, mounted.suite), reason] = (
-                    carriers | {mounted.carrier},
-                    count + messages[episode, carrier, key],
-                )
+            for omission in lacks(delivered, carrier):
+                mounted = delivered.of[carrier][omission.sensor].mounted
+                sentence = _called(omission.sensor[0], mounted.sensor, mounted.suite), omission.reason
+                carriers, count = lacking.get(sentence, (set(), 0))
+                lacking[sentence] = carriers | {mounted.carrier}, count + omission.messages
     lines = [
         f"{called}: {reason} ({count} messages of {', '.join(sorted(carriers)[:3])}{' …' if len(carriers) > 3 else ''})"
         for (called, reason), (carriers, count) in sorted(lacking.items())

@@ -25,13 +25,12 @@ from caraware.data.export.frames import (
     Frame,
     LidarScan,
     RadarSample,
-    SensorKey,
     SensorMessage,
     delivered_sensors,
     frames,
 )
 from caraware.data.export.scans import box_middle, inverse, require_channels, upright_pose, vehicle_pose
-from caraware.data.export.sensors import SensorLabels, carrier_name, lack_colours
+from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Array, Episode, Message, Recording
 from caraware.ipc.arrays import Float64Array
@@ -189,7 +188,7 @@ def play(recording: Recording, episode: Episode, sink: Sink) -> None:
                 del states[old]
 
 
-def lacks(delivered: DeliveredSensors, carrier: int) -> dict[SensorKey, str]:
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
     """Every sensor has topics; images have colours alone."""
     return lack_colours(delivered, carrier)
 
