@@ -508,10 +508,10 @@ fn interval(text: &str) -> Result<f64, String> {
 pub struct ExportArgs {
     /// A recording: its file, or the directory or name of its run
     pub recording: PathBuf,
-    /// Format: tables of vehicle-ticks (parquet, csv), SUMO's floating car data (fcd), cooperative perception (opv2v), points
-    /// and images with boxes (kitti, nuscenes), offline reinforcement learning (minari), or messages for the tools of robotics
-    /// (foxglove, ros2)
-    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v", "kitti", "nuscenes", "minari", "foxglove", "ros2"])]
+    /// Format: tables of vehicle-ticks (parquet, csv), a table of radar detections (radar), SUMO's floating car data (fcd),
+    /// cooperative perception (opv2v), points and images with boxes (kitti, nuscenes), offline reinforcement learning (minari), or
+    /// messages for the tools of robotics (foxglove, ros2)
+    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "radar", "fcd", "opv2v", "kitti", "nuscenes", "minari", "foxglove", "ros2"])]
     pub to: String,
     /// Directory to write to; parts that it has are kept [default: export-FORMAT beside the recording]
     #[arg(long, value_name = "DIRECTORY")]

@@ -9,7 +9,10 @@ use std::{
 
 use crate::common::{Spectator, Workplace, assert_documented, free_port, text, until, with_mounts};
 use ipc_schema::{activity::Awaited, channel::Channel, process::Process};
-use recorder::file::reader::RecordingReader;
+use recorder::file::{
+    reader::{RecordedMessage, RecordingReader},
+    writer::LineTopic,
+};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// A short training run of six vehicles, without viewers.
@@ -276,6 +279,11 @@ fn recorders_that_watch_do_not_change_a_run_and_count_what_they_miss() {
     let directory = run_dir(&workplace, "watched");
     let file = directory.join("recording.mcap");
     until(&mut run, "the recording", || file.exists().then_some(()));
+    // It is refused while the simulation starts.
+    let switch = ["control", "--run", "watched", "sensor", "all", "imu", "off"];
+    until(&mut run, "the command", || {
+        workplace.run(&switch).status.success().then_some(())
+    });
     // A second recorder beside the run, of one channel.
     let beside = workplace.succeed(&[
         "record",
@@ -291,7 +299,7 @@ fn recorders_that_watch_do_not_change_a_run_and_count_what_they_miss() {
     let report = workplace.report("watched");
     let recorded = &report["environments"][0]["recording"];
     for (path, missed) in [
-        (file, recorded["missed_ticks"].as_u64().unwrap()),
+        (file.clone(), recorded["missed_ticks"].as_u64().unwrap()),
         (workplace.path().join("beside.mcap"), u64::MAX),
     ] {
         let recording = RecordingReader::open(&path).unwrap();
@@ -305,6 +313,18 @@ fn recorders_that_watch_do_not_change_a_run_and_count_what_they_miss() {
         );
         assert!(found.len() > 100, "{}", found.len());
     }
+    // The command is in the recording as it is in the run's log.
+    let log = std::fs::read_to_string(directory.join("commands.jsonl")).unwrap();
+    let recorded_lines: Vec<String> = RecordingReader::open(&file)
+        .unwrap()
+        .messages()
+        .filter_map(|message| match message.unwrap() {
+            RecordedMessage::Line(LineTopic::Commands, line) => Some(line),
+            _ => None,
+        })
+        .collect();
+    assert!(log.contains("imu"), "{log}");
+    assert_eq!(recorded_lines, log.lines().collect::<Vec<_>>());
     // A channel that does not exist is refused with the names of those that do.
     let refused = workplace.run(&["simulate", "--record", "--set", "record.channels=[\"observations\"]"]);
     assert_eq!(refused.status.code(), Some(2));

@@ -12,13 +12,26 @@ from pathlib import Path
 
 from caraware.data.export.card import write_card
 from caraware.data.export.parts import FORMATS, part_name, write_part
+from caraware.data.export.sensors import omissions
 from caraware.data.recording import RecordingError, open_recording
 
 
-def export(recording_path: Path, format_name: str, directory: Path, jobs: int, show: Callable[[int, int], None]) -> int:
+def _report(line: str) -> None:
+    """Print a sentence about what an export lacks."""
+    print(f"caraware export: {line}", file=sys.stderr)
+
+
+def export(
+    recording_path: Path,
+    format_name: str,
+    directory: Path,
+    jobs: int,
+    show: Callable[[int, int], None],
+    report: Callable[[str], None] = _report,
+) -> int:
     """Write every episode that the directory does not have yet; return the number of parts written.
 
-    Raises `RecordingError`.
+    `report` gets a sentence for each sensor that the format leaves out in whole or in part. Raises `RecordingError`.
     """
     recording, chosen = open_recording(recording_path), FORMATS[format_name]
     # The memory maps are made once, before other processes need them.
@@ -47,7 +60,10 @@ def export(recording_path: Path, format_name: str, directory: Path, jobs: int, s
                 show(done := done + 1, len(names))
     if chosen.join is not None:
         chosen.join(recording, directory, list(names.values()))
-    write_card(recording, directory, chosen.title, chosen.meaning, list(names.values()))
+    lacking = omissions(recording, chosen.lacks, has_observations=chosen.has_observations)
+    for line in lacking:
+        report(f"left out: {line}")
+    write_card(recording, directory, chosen.title, chosen.meaning, list(names.values()), lacking)
     return len(due)
 
 

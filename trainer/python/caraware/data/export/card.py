@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from caraware import _native
+from caraware.data.export.sensors import mounted_sensors, roadside_carriers
 from caraware.data.recording import Episode, Recording
 
 SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic", "camera", "radar")
 """Tables of the configuration that describe sensors."""
 
 
-def card(recording: Recording, format_name: str, meaning: str, parts: list[str]) -> str:
-    """The card as Markdown."""
+def card(recording: Recording, format_name: str, meaning: str, parts: list[str], lacking: list[str]) -> str:
+    """The card as Markdown; `lacking` has a sentence for each sensor that the export leaves out in whole or in part."""
     start, run = recording.start, recording.run
     end, config = recording.end, run["config"]
     hash_line = end["observation_hash"] if end else "none: the recording was not finished"
@@ -45,7 +46,16 @@ def card(recording: Recording, format_name: str, meaning: str, parts: list[str])
     ]
     for name in SENSORS:
         lines += [f"### {name}", "", *_settings(config.get(name, {})), ""]
+    if run.get("sensor_units"):
+        lines += ["## Mounted sensors", "", *mounted_sensors(run), ""]
+        lines += ["What a sensor of a suite does not set is as in the section of its kind, above.", ""]
+    if carriers := roadside_carriers(run):
+        lines += ["## Beside the road", "", *carriers, ""]
     lines += [
+        "## Left out",
+        "",
+        *([f"- {line}" for line in lacking] or ["No recorded sensor is left out."]),
+        "",
         "## Licence",
         "",
         "The program is under MIT or Apache-2.0, and puts no terms on its results. Maps and demand of a scenario of",
@@ -78,6 +88,8 @@ def _settings(values: dict[str, Any]) -> list[str]:
     return [f"- `{key}` = {value}" for key, value in values.items()]
 
 
-def write_card(recording: Recording, directory: Path, format_name: str, meaning: str, parts: list[str]) -> None:
-    """Write `README.md` of an export."""
-    (directory / "README.md").write_text(card(recording, format_name, meaning, parts), encoding="utf-8")
+def write_card(
+    recording: Recording, directory: Path, format_name: str, meaning: str, parts: list[str], lacking: list[str]
+) -> None:
+    """Write `README.md` of an export (`card`)."""
+    (directory / "README.md").write_text(card(recording, format_name, meaning, parts, lacking), encoding="utf-8")

@@ -34,18 +34,17 @@ from caraware.data.export.card import source
 from caraware.data.export.scans import projection, quaternion
 from caraware.data.export.streams import (
     COLOURS,
-    POINT_FIELDS,
     WORLD,
     Box,
     Fix,
     Odometry,
     Placed,
+    SensorTopic,
     covariance,
-    packed_points,
     play,
 )
 from caraware.data.recording import Array, Episode, Recording
-from caraware.ipc.arrays import Float32Array, Float64Array
+from caraware.ipc.arrays import Float64Array
 
 NUMERIC_TYPES = {"<f4": PackedElementField.FLOAT32, "<u4": PackedElementField.UINT32, "<u2": PackedElementField.UINT16}
 """Foxglove's types of the fields of points."""
@@ -77,8 +76,8 @@ class FoxgloveSink:
     def _write(self, topic: str, time_ns: int, message: Message) -> None:
         self._writer.write_message(topic, message, log_time=time_ns, publish_time=time_ns)
 
-    def transforms(self, time_ns: int, placed: list[Placed]) -> None:
-        """`/tf`."""
+    def transforms(self, time_ns: int, placed: list[Placed], *, are_static: bool = False) -> None:
+        """`/tf`; `/tf_static`, once for each frame."""
         transforms = [
             FrameTransform(
                 timestamp=_timestamp(time_ns),
@@ -89,7 +88,7 @@ class FoxgloveSink:
             )
             for one in placed
         ]
-        self._write("/tf", time_ns, FrameTransforms(transforms=transforms))
+        self._write("/tf_static" if are_static else "/tf", time_ns, FrameTransforms(transforms=transforms))
 
     def boxes(self, time_ns: int, boxes: list[Box]) -> None:
         """`/road_users`: an entity for each, which ends with the tick."""
@@ -143,26 +142,25 @@ class FoxgloveSink:
     def imu(self, time_ns: int, vehicle: str, accel_mps2: Array, rate_radps: Array) -> None:
         """Nothing: Foxglove has no schema for it."""
 
-    def points(self, time_ns: int, vehicle: str, position_m: Float32Array, points: Array) -> None:
-        """`/vehicle_N/lidar`."""
-        packed = packed_points(position_m, points)
+    def points(self, time_ns: int, place: SensorTopic, points: Array) -> None:
+        """The topic of a LIDAR or a radar."""
         fields = [
-            PackedElementField(name=name, offset=offset, type=NUMERIC_TYPES[scalar])
-            for name, (scalar, offset) in POINT_FIELDS.items()
+            PackedElementField(name=name, offset=offset, type=NUMERIC_TYPES[scalar.str])
+            for name, (scalar, offset, *_) in (points.dtype.fields or {}).items()
         ]
         message = PointCloud(
             timestamp=_timestamp(time_ns),
-            frame_id=f"{vehicle}/lidar",
+            frame_id=place.frame,
             pose=_pose(np.eye(4)),
-            point_stride=packed.itemsize,
+            point_stride=points.itemsize,
             fields=fields,
-            data=packed.tobytes(),
+            data=points.tobytes(),
         )
-        self._write(f"/{vehicle}/lidar", time_ns, message)
+        self._write(place.topic, time_ns, message)
 
-    def image(self, time_ns: int, vehicle: str, png: bytes, head: np.void) -> None:
-        """`/vehicle_N/camera` and `/vehicle_N/camera_calibration`."""
-        stamp, frame, matrix = _timestamp(time_ns), f"{vehicle}/camera_optical", projection(head)
+    def image(self, time_ns: int, place: SensorTopic, png: bytes, head: np.void) -> None:
+        """The topic of a camera, and that of its calibration."""
+        stamp, frame, matrix = _timestamp(time_ns), place.frame, projection(head)
         image = CompressedImage(timestamp=stamp, frame_id=frame, data=png, format="png")
         calibration = CameraCalibration(
             timestamp=stamp,
@@ -173,8 +171,8 @@ class FoxgloveSink:
             R=np.eye(3).ravel().tolist(),
             P=matrix.ravel().tolist(),
         )
-        self._write(f"/{vehicle}/camera", time_ns, image)
-        self._write(f"/{vehicle}/camera_calibration", time_ns, calibration)
+        self._write(place.topic, time_ns, image)
+        self._write(f"{place.calibration}calibration", time_ns, calibration)
 
 
 def write_foxglove(recording: Recording, episode: Episode, path: Path) -> None:

@@ -1,6 +1,7 @@
-"""KITTI: points, calibration, labels and images of each vehicle with a LIDAR, in the layout of the object benchmark.
+"""KITTI: points, calibration, labels and images of each carrier of a LIDAR, in the layout of the object benchmark.
 
-A part is a directory of one episode with a directory for each carrier, in which `training/` is as KITTI's. Frames are
+A part is a directory of one episode with a directory for each carrier, in which `training/` is as KITTI's. A carrier
+has the points of its main LIDAR and at most four cameras; the format has no place for more, nor for radars. Frames are
 numbered by ticks. The camera's frame is KITTI's: x right, y down, z forward; without a camera it is at the LIDAR.
 Places of sensors are those of their mounts.
 """
@@ -8,28 +9,35 @@ Places of sensors are those of their mounts.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from caraware.data.export.frames import (
+    CameraImage,
+    DeliveredSensors,
+    Frame,
+    LidarScan,
+    SensorKey,
+    delivered_sensors,
+    frames,
+)
 from caraware.data.export.oxts import Geodesy, packet
 from caraware.data.export.scans import (
     OPTICAL,
-    CameraImage,
-    Frame,
     box_middle,
     class_by_size,
-    forward_m,
-    frames,
     inverse,
     projection,
+    require_channels,
     rotated,
     upright_pose,
     vehicle_pose,
 )
+from caraware.data.export.sensors import Omission, carrier_name, lack_colours, left_out, left_out_without
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -52,10 +60,63 @@ CAMERA_NUMBERS = (2, 3, 0, 1)
 """Numbers of a carrier's cameras, the main one first, unless they are named `image_0` to `image_3` as KITTI's are."""
 
 
+def camera_numbers(names: Sequence[str]) -> dict[int, int]:
+    """KITTI's numbers of cameras with these names, the main one first: at most four, with their places in `names`."""
+    named = {int(name[-1]): place for place, name in enumerate(names) if re.fullmatch("image_[0-3]", name)}
+    return named if len(named) == len(names) else dict(zip(CAMERA_NUMBERS, range(len(names)), strict=False))
+
+
 def numbered(images: Sequence[CameraImage]) -> dict[int, CameraImage]:
-    """The images of a frame by KITTI's numbers of cameras: at most four."""
-    named = {int(image.camera[-1]): image for image in images if re.fullmatch("image_[0-3]", image.camera)}
-    return named if len(named) == len(images) else dict(zip(CAMERA_NUMBERS, images, strict=False))
+    """The images of a frame by KITTI's numbers of cameras."""
+    places = camera_numbers([image.mounted.sensor for image in images])
+    return {number: images[place] for number, place in places.items()}
+
+
+def _exported_cameras(delivered: DeliveredSensors, carrier: int) -> list[SensorKey]:
+    """The cameras of a carrier for which KITTI has a place, the main one first."""
+    cameras = delivered.cameras(carrier)
+    places = camera_numbers([delivered.of[carrier][key].mounted.sensor for key in cameras]).values()
+    return [key for place, key in enumerate(cameras) if place in places]
+
+
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """KITTI has a place for one LIDAR and four cameras of a carrier, and for the colours of images."""
+    main, cameras = delivered.main_lidar(carrier), _exported_cameras(delivered, carrier)
+    if main is None:
+        return left_out(delivered, carrier, delivered.of[carrier], "its carrier has no LIDAR, which a frame needs")
+    others = {kind: [key for key in delivered.of[carrier] if key[0] == kind] for kind in ("lidar", "camera", "radar")}
+    lidars, more = ([key for key in others[kind] if key not in (main, *cameras)] for kind in ("lidar", "camera"))
+    return [
+        *(one for one in lack_colours(delivered, carrier) if one.sensor in cameras),
+        *left_out(delivered, carrier, lidars, "KITTI has a place for one LIDAR, which is the main one of its carrier"),
+        *left_out(delivered, carrier, more, "KITTI has a place for four cameras"),
+        *left_out(delivered, carrier, others["radar"], "KITTI has no place for radars"),
+        *left_out_without(
+            delivered, carrier, [main, *cameras], [main, *cameras], "a frame needs a scan and all images of its tick"
+        ),
+    ]
+
+
+@dataclass(frozen=True)
+class _KittiFrame:
+    """A frame that has the sensors for which KITTI has a place, and no others."""
+
+    frame: Frame
+    scan: LidarScan
+
+    @property
+    def images(self) -> tuple[CameraImage, ...]:
+        return self.frame.images
+
+
+def _kitti_frames(recording: Recording, episode: Episode) -> Iterator[_KittiFrame]:
+    """Scans of main LIDARs. Of a carrier with cameras only those with all images of their tick: some are missed."""
+    delivered = delivered_sensors(recording, episode)
+    for frame in frames(recording, episode, delivered):
+        cameras = _exported_cameras(delivered, frame.carrier)
+        images = tuple(image for image in frame.images if image.key in cameras)
+        if frame.main is not None and len(images) == len(cameras):
+            yield _KittiFrame(replace(frame, other_scans=(), images=images, radars=()), frame.main)
 
 
 @dataclass(frozen=True)
@@ -72,11 +133,12 @@ class Calibration:
     """f64 [3, 4], from the carrier's frame: x forward of the rear axle's centre on the ground, y left, z up."""
 
     @classmethod
-    def of(cls, frame: Frame) -> Calibration:
+    def of(cls, kitti: _KittiFrame) -> Calibration:
         """From the poses that the messages hold: those of the mounted sensors at the tick."""
-        lidar, cameras = frame.world_from_lidar, numbered(frame.images)
-        reference = cameras.get(0, frame.images[0] if frame.images else None)
-        world_from_camera = lidar if reference is None else reference.world_from_camera
+        lidar, cameras = kitti.scan.world_from_sensor, numbered(kitti.images)
+        main = kitti.images[0] if kitti.images else None
+        reference = cameras.get(0, main)
+        world_from_camera = lidar if reference is None else reference.world_from_sensor
         camera_from_world = rotated(OPTICAL) @ inverse(world_from_camera)
         world_from_reference = inverse(camera_from_world)
 
@@ -85,16 +147,15 @@ class Calibration:
                 return np.eye(3, 4)
             if image is reference:
                 return projection(image.head)
-            own_from_reference = rotated(OPTICAL) @ inverse(image.world_from_camera) @ world_from_reference
+            own_from_reference = rotated(OPTICAL) @ inverse(image.world_from_sensor) @ world_from_reference
             matrix: Float64Array = projection(image.head) @ own_from_reference
             return matrix
 
-        main = frame.images[0] if frame.images else None
         return cls(
             tuple(projected(cameras.get(number, main)) for number in range(4)),
             camera_from_world[:3],
             (camera_from_world @ lidar)[:3],
-            (inverse(lidar) @ vehicle_pose(frame.own))[:3],
+            (inverse(lidar) @ vehicle_pose(kitti.frame.own))[:3],
         )
 
     def text(self) -> str:
@@ -134,12 +195,12 @@ def _image_part(seen: np.void, head: np.void) -> tuple[str, str]:
     return f"{truncated:.2f} {occluded}", f"{left:.2f} {top:.2f} {right:.2f} {bottom:.2f}"
 
 
-def _labels(frame: Frame, calibration: Calibration, users: RoadUsers) -> str:
+def _labels(kitti: _KittiFrame, calibration: Calibration, users: RoadUsers) -> str:
     """The file of `label_2/`: each road user with a point of the LIDAR or a pixel of an image; boxes of `image_2`."""
-    boxes = numbered(frame.images).get(2)
+    boxes = numbered(kitti.images).get(2)
     seen, head = ({}, None) if boxes is None else (boxes.seen, boxes.head)
     lines = []
-    for state in frame.labelled():
+    for state in kitti.frame.labelled():
         vehicle = int(state["vehicle"])
         (x, y, z), rotation_y = _place(state, calibration.camera_from_world)
         alpha = float(np.mod(rotation_y - np.arctan2(x, z) + np.pi, 2 * np.pi) - np.pi)
@@ -154,12 +215,14 @@ def _labels(frame: Frame, calibration: Calibration, users: RoadUsers) -> str:
 
 def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
+    require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
     users, geodesy = RoadUsers(recording), Geodesy(recording)
-    for frame in frames(recording, episode):
-        carrier = path / str(frame.carrier)
-        _write_frame(carrier, frame, users)
-        (carrier / "training" / "oxts" / f"{frame.scan.tick:06}.txt").write_text(packet(frame.own, geodesy))
+    for kitti in _kitti_frames(recording, episode):
+        carrier = path / carrier_name(kitti.frame.carrier).removeprefix("vehicle_")
+        _write_frame(carrier, kitti, users)
+        line = packet(kitti.frame.own, geodesy)
+        (carrier / "training" / "oxts" / f"{kitti.frame.tick:06}.txt").write_text(line, encoding="utf-8")
     if not any(path.iterdir()):
         raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")
     for carrier in path.iterdir():
@@ -172,16 +235,16 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
         (carrier / "training" / "times.txt").write_text(times, encoding="utf-8")
 
 
-def _write_frame(carrier: Path, frame: Frame, users: RoadUsers) -> None:
-    training, name = carrier / "training", f"{frame.scan.tick:06}"
-    images = numbered(frame.images)
+def _write_frame(carrier: Path, kitti: _KittiFrame, users: RoadUsers) -> None:
+    training, name = carrier / "training", f"{kitti.frame.tick:06}"
+    images = numbered(kitti.images)
     for folder in ("velodyne", "calib", "label_2", "oxts", *(f"image_{number}" for number in images)):
         (training / folder).mkdir(parents=True, exist_ok=True)
-    rows = np.concatenate((forward_m(frame.head, frame.points), frame.points["intensity"][:, None]), 1).astype("<f4")
+    rows = np.concatenate((kitti.scan.forward_m, kitti.scan.points["intensity"][:, None]), 1).astype("<f4")
     (training / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
-    calibration = Calibration.of(frame)
+    calibration = Calibration.of(kitti)
     (training / "calib" / f"{name}.txt").write_text(calibration.text(), encoding="utf-8")
-    (training / "label_2" / f"{name}.txt").write_text(_labels(frame, calibration, users), encoding="utf-8")
+    (training / "label_2" / f"{name}.txt").write_text(_labels(kitti, calibration, users), encoding="utf-8")
     for number, image in images.items():
         if (rgb := image.rgb) is not None:
             Image.fromarray(rgb).save(training / f"image_{number}" / f"{name}.png")

@@ -1,4 +1,4 @@
-"""nuScenes: a scene for each vehicle with a LIDAR in each episode, with its sweeps, images, poses and boxes.
+"""nuScenes: a scene for each carrier of a LIDAR in each episode, with sweeps, images, radar, poses and boxes.
 
 A part is a directory of one episode with its files and its rows of the tables; the data set is made of all parts: the
 tables of nuScenes' devkit in `v1.0-caraware/`, whose file names are those of the parts. Frames are nuScenes': the ego
@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -19,21 +21,30 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from caraware.data.export.scans import (
-    OPTICAL,
+from caraware.data.export.detections import nuscenes_points
+from caraware.data.export.frames import (
+    CameraImage,
+    DeliveredSensors,
     Frame,
+    LidarScan,
+    RadarSample,
+    SensorKey,
+    SensorMessage,
+    delivered_sensors,
+    frames,
+)
+from caraware.data.export.scans import (
     box_middle,
     class_by_size,
-    filmed,
-    forward_m,
-    frames,
     inverse,
     projection,
     quaternion,
+    require_channels,
     rotated,
     upright_pose,
     vehicle_pose,
 )
+from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours, left_out
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -74,16 +85,20 @@ ATTRIBUTES = {
 VISIBILITIES = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 """Levels of visibility by their tokens."""
 
-LIDAR_CHANNEL, CAMERA_CHANNEL = "LIDAR_TOP", "CAM_FRONT"
-"""Channels of the LIDAR and of the camera of a section; cameras of suites have their names for a channel."""
+LIDAR_CHANNEL, CAMERA_CHANNEL, RADAR_CHANNEL = "LIDAR_TOP", "CAM_FRONT", "RADAR_FRONT"
+"""Channels of the main LIDAR, and of the camera and the radar of a section."""
+
+MODALITIES = {"LIDAR": "lidar", "CAM": "camera", "RADAR": "radar"}
+"""Modality of a channel by the begin of its name."""
 
 
-def camera_channel(camera: str) -> str:
-    """The channel of a camera with this name; nuScenes' begin with `CAM_`, and so do ours."""
-    if camera == "camera":
-        return CAMERA_CHANNEL
-    name = camera.upper().replace(" ", "_")
-    return name if name.startswith("CAM_") else f"CAM_{name}"
+def sensor_channel(kind: str, name: str) -> str:
+    """The channel of a sensor: its name in capitals, with the begin that nuScenes' channels of its kind have."""
+    if name == kind:
+        return {"camera": CAMERA_CHANNEL, "radar": RADAR_CHANNEL}.get(kind, "LIDAR")
+    begin = next(begin for begin, modality in MODALITIES.items() if modality == kind)
+    channel = re.sub(r"[^A-Z0-9_]", "_", name.upper())
+    return channel if channel.startswith(f"{begin}_") else f"{begin}_{channel}"
 
 
 TABLES = (
@@ -139,8 +154,9 @@ class _Scene:
     log_token: str
     """Of the episode."""
     tick_s: float
-    cameras: int
-    """Cameras whose images its key frames have."""
+    cameras: frozenset[SensorKey]
+    """Cameras with colours, whose images its key frames have."""
+    labels: SensorLabels
     users: RoadUsers
     rows: dict[str, list[Row]] = field(default_factory=lambda: {table: [] for table in TABLES})
     key_tick: int | None = None
@@ -149,6 +165,10 @@ class _Scene:
     """Files since the newest key frame: they belong to the next."""
     newest: dict[str, Row] = field(default_factory=dict)
     """The newest row of each chain."""
+    samples: dict[str, tuple[Row, SensorMessage]] = field(default_factory=dict)
+    """The newest file of each channel since the newest key frame, and its message."""
+    calibrations: set[str] = field(default_factory=set)
+    """Tokens of the mountings."""
     instances: dict[str, Row] = field(default_factory=dict)
     """Road users with a box, by their tokens."""
 
@@ -157,22 +177,35 @@ class _Scene:
         return token(self.run, self.name, *words)
 
     def add(self, frame: Frame) -> None:
-        """Add a frame: a key frame if it is time for one and every sensor of the carrier has delivered."""
-        tick = frame.scan.tick
-        images = [(image, rgb) for image in frame.images if (rgb := image.rgb) is not None]
-        is_due = self.key_tick is None or (tick - self.key_tick) * self.tick_s >= KEY_FRAME_S - 1e-9
-        is_key = is_due and len(images) == self.cameras
-        points = np.zeros((len(frame.points), 5), "<f4")
-        points[:, :3] = forward_m(frame.head, frame.points) @ LIDAR_AXES
-        points[:, 3], points[:, 4] = frame.points["intensity"] * 255, frame.points["channel"]
-        lidar = frame.world_from_lidar @ rotated(LIDAR_AXES)
-        self._file(frame, LIDAR_CHANNEL, is_key, lidar, "pcd.bin").write_bytes(points.tobytes())
-        for image, rgb in images:
-            camera, channel = image.world_from_camera @ rotated(OPTICAL.T), camera_channel(image.camera)
-            Image.fromarray(rgb).save(self._file(frame, channel, is_key, camera, "png", image.head))
-        if is_key:
-            self.key_tick = tick
+        """Add a frame: a key frame if it is time for one, and the main LIDAR and every camera have delivered.
+
+        A key frame has the newest scan of each other LIDAR and radar since the key frame before.
+        """
+        for scan in frame.scans:
+            points = np.zeros((len(scan.points), 5), "<f4")
+            points[:, :3] = scan.forward_m @ LIDAR_AXES
+            points[:, 3], points[:, 4] = scan.points["intensity"] * 255, scan.points["channel"]
+            self._file(frame, scan, "pcd.bin").write_bytes(points.tobytes())
+        for image in frame.images:
+            if (rgb := image.rgb) is not None:
+                Image.fromarray(rgb).save(self._file(frame, image, "png"))
+        for radar in frame.radars:
+            self._file(frame, radar, "pcd").write_bytes(nuscenes_points(radar, frame.own))
+        is_due = self.key_tick is None or (frame.tick - self.key_tick) * self.tick_s >= KEY_FRAME_S - 1e-9
+        if is_due and frame.main is not None and self.cameras <= {image.key for image in frame.images}:
+            self.key_tick = frame.tick
+            for row, _ in self.samples.values():
+                self._make_sample(row)
             self._sample(frame)
+            self.samples.clear()
+
+    def _make_sample(self, row: Row) -> None:
+        """Make a file one of the key frame."""
+        sweep = Path(row["filename"])
+        sample = Path("samples", *sweep.parts[1:])
+        (self.part / sample).parent.mkdir(parents=True, exist_ok=True)
+        (self.part / sweep).rename(self.part / sample)
+        row |= {"filename": str(sample), "is_key_frame": True}
 
     def finish(self) -> None:
         """Give the last sweeps to the last key frame, and write what is known only now."""
@@ -206,63 +239,66 @@ class _Scene:
         self.newest[chain] = row
         self.rows[table].append(row)
 
-    def _file(
-        self,
-        frame: Frame,
-        channel: str,
-        is_key: bool,
-        world_from_sensor: Float64Array,
-        ending: str,
-        camera: np.void | None = None,
-    ) -> Path:
+    def _file(self, frame: Frame, sensor: SensorMessage, ending: str) -> Path:
         """Add the row of a file of a sensor, with the pose of the carrier and of the sensor on it; return its path."""
-        tick = frame.scan.tick
-        name = Path("samples" if is_key else "sweeps") / channel / f"{self.name}__{channel}__{tick:06}.{ending}"
+        channel = LIDAR_CHANNEL if sensor is frame.main else self.labels.of(sensor.key)
+        camera = sensor.head if isinstance(sensor, CameraImage) else None
+        name = Path("sweeps") / channel / f"{self.name}__{channel}__{frame.tick:06}.{ending}"
         path = self.part / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        timestamp = round(tick * self.tick_s * 1e6)
-        ego = self.token("ego_pose", channel, tick)
+        timestamp = round(frame.tick * self.tick_s * 1e6)
+        ego = self.token("ego_pose", channel, frame.tick)
         world_from_ego = vehicle_pose(frame.own)
         self.rows["ego_pose"].append({"token": ego, "timestamp": timestamp, **_placed(world_from_ego)})
+        ego_from_sensor = inverse(world_from_ego) @ _world_from(sensor)
         row = {
-            "token": self.token(channel, tick),
+            "token": self.token(channel, frame.tick),
             "sample_token": "",
             "ego_pose_token": ego,
-            "calibrated_sensor_token": self._calibration(channel, inverse(world_from_ego) @ world_from_sensor, camera),
+            "calibrated_sensor_token": self._calibration(channel, ego_from_sensor, camera),
             "timestamp": timestamp,
             "fileformat": ending.split(".")[0],
-            "is_key_frame": is_key,
+            "is_key_frame": False,
             "height": 0 if camera is None else int(camera["height"]),
             "width": 0 if camera is None else int(camera["width"]),
             "filename": str(name),
         }
         self._link("sample_data", channel, row)
         self.waiting.append(row)
+        self.samples[channel] = row, sensor
         return path
 
     def _calibration(self, channel: str, ego_from_sensor: Float64Array, camera: np.void | None) -> str:
         """The token of a sensor's mounting; one that has not changed by more than the rounding of poses is the same."""
         intrinsic = [] if camera is None else projection(camera)[:, :3].tolist()
         known = self.token(channel, np.round(ego_from_sensor, 4).tolist(), intrinsic)
-        if all(row["token"] != known for row in self.rows["calibrated_sensor"]):
+        if known not in self.calibrations:
+            self.calibrations.add(known)
             row = {"token": known, "sensor_token": token(channel), **_placed(ego_from_sensor)}
             self.rows["calibrated_sensor"].append(row | {"camera_intrinsic": intrinsic})
         return known
 
     def _sample(self, frame: Frame) -> None:
         """Add a key frame with its boxes, to which the files since the one before belong."""
-        sample = self.token("sample", frame.scan.tick)
+        sample = self.token("sample", frame.tick)
         for row in self.waiting:
             row["sample_token"] = sample
         self.waiting.clear()
-        timestamp = round(frame.scan.tick * self.tick_s * 1e6)
+        timestamp = round(frame.tick * self.tick_s * 1e6)
         self._link("sample", "sample", {"token": sample, "timestamp": timestamp, "scene_token": self.token()})
-        hit, counts = np.unique(frame.points["object"], return_counts=True)
-        points_on = dict(zip(hit.tolist(), counts.tolist(), strict=True))
-        for state in frame.labelled():
-            self._annotate(frame, state, sample, points_on.get(int(state["vehicle"]), 0))
+        points_on, echoes_of = Counter[int](), Counter[int]()
+        for _, sensor in self.samples.values():
+            if isinstance(sensor, LidarScan):
+                points_on.update(sensor.points["object"].tolist())
+            elif isinstance(sensor, RadarSample):
+                echoes_of.update(sensor.detections["object_id"].tolist())
+        shown = {int(state["vehicle"]) for state in frame.labelled()}
+        for state in frame.states:
+            vehicle = int(state["vehicle"])
+            if vehicle != frame.carrier and (vehicle in shown or points_on[vehicle] or echoes_of[vehicle]):
+                self._annotate(frame, state, sample, points_on[vehicle], echoes_of[vehicle])
 
-    def _annotate(self, frame: Frame, state: np.void, sample: str, points: int) -> None:
+    def _annotate(self, frame: Frame, state: np.void, sample: str, points: int, echoes: int) -> None:
         """Add the box of a road user in a key frame, and count it for its instance."""
         vehicle = int(state["vehicle"])
         name = category(state, self.users.of(state["id_hash"]).vehicle_class)
@@ -283,7 +319,7 @@ class _Scene:
                 "size": [float(state[key]) for key in ("width_m", "length_m", "height_m")],
                 "rotation": quaternion(world_from_box[:3, :3]),
                 "num_lidar_pts": points,
-                "num_radar_pts": 0,
+                "num_radar_pts": echoes,
             },
         )
         of_instance = self.instances.setdefault(
@@ -298,29 +334,49 @@ def _placed(transform: Float64Array) -> Row:
     return {"translation": [float(value) for value in transform[:3, 3]], "rotation": quaternion(transform[:3, :3])}
 
 
-def _coloured(recording: Recording) -> set[int]:
-    """Numbers of the cameras that deliver colours."""
-    config = recording.run["config"]
-    suites = [sensor for suite in config.get("suite", []) for sensor in suite["sensor"]]
-    settings = [config["camera"], *(sensor for sensor in suites if sensor["kind"] == "camera")]
-    return {number for number, camera in enumerate(settings) if camera["rgb"]}
+def _world_from(sensor: SensorMessage) -> Float64Array:
+    """f64 [4, 4]: from the frame that a sensor of this kind has in nuScenes."""
+    if isinstance(sensor, CameraImage):
+        return sensor.world_from_optical
+    if isinstance(sensor, LidarScan):
+        return sensor.world_from_sensor @ rotated(LIDAR_AXES)
+    return sensor.world_from_sensor
+
+
+def _coloured(delivered: DeliveredSensors, carrier: int) -> frozenset[SensorKey]:
+    """The cameras of a carrier whose images have colours."""
+    return frozenset(key for key in delivered.cameras(carrier) if "rgb" in delivered.of[carrier][key].planes)
+
+
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """A scene needs a LIDAR and a key frame; images have colours alone."""
+    main, sensors = delivered.main_lidar(carrier), delivered.of[carrier]
+    if main is None:
+        return left_out(delivered, carrier, sensors, "its carrier has no LIDAR, which a scene needs")
+    if delivered.ticks_with(carrier, {main} | _coloured(delivered, carrier)) == 0:
+        reason = "its carrier has no tick with a scan of the main LIDAR and all images, which a key frame needs"
+        return left_out(delivered, carrier, sensors, reason)
+    return lack_colours(delivered, carrier)
 
 
 def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
+    require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
     users, run = RoadUsers(recording), str(recording.start["run"])
+    labels = SensorLabels(recording.run, sensor_channel, [LIDAR_CHANNEL])
     log = token(run, "log", episode.number)
-    cameras: dict[int, set[int]] = {}
-    for (vehicle, _), numbers in filmed(recording, episode).items():
-        cameras.setdefault(vehicle, set()).update(numbers & _coloured(recording))
+    delivered = delivered_sensors(recording, episode)
     scenes: dict[int, _Scene] = {}
-    for frame in frames(recording, episode, every_scan=True):
-        vehicle = frame.carrier
-        if vehicle not in scenes:
-            name = f"scene-{episode.number:05}-{vehicle}"
-            scenes[vehicle] = _Scene(name, run, path, log, recording.tick_s, len(cameras.get(vehicle, ())), users)
-        scenes[vehicle].add(frame)
+    for frame in frames(recording, episode, delivered):
+        carrier = frame.carrier
+        if delivered.main_lidar(carrier) is None:
+            continue
+        if carrier not in scenes:
+            name = f"scene-{episode.number:05}-{carrier_name(carrier).removeprefix('vehicle_')}"
+            cameras = _coloured(delivered, carrier)
+            scenes[carrier] = _Scene(name, run, path, log, recording.tick_s, cameras, labels, users)
+        scenes[carrier].add(frame)
     if not scenes:
         raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")
     rows: dict[str, list[Row]] = {table: [] for table in TABLES}
@@ -356,7 +412,7 @@ def join_parts(recording: Recording, directory: Path, parts: Sequence[str]) -> N
     ]
     channels = {LIDAR_CHANNEL, CAMERA_CHANNEL} | {Path(row["filename"]).parent.name for row in tables["sample_data"]}
     tables["sensor"] = [
-        {"token": token(name), "channel": name, "modality": "lidar" if name == LIDAR_CHANNEL else "camera"}
+        {"token": token(name), "channel": name, "modality": MODALITIES[name.split("_")[0]]}
         for name in sorted(channels, reverse=True)
     ]
     # The devkit wants a raster map; a recording has none, so it is one pixel of background.

@@ -1,8 +1,9 @@
 """OPV2V: cooperative perception with any number of agents, as OpenCOOD loads it.
 
-A part is a directory of one episode (a *scenario* there), with a directory for each vehicle that carries a LIDAR and,
-in it, a `.yaml`, a `.pcd` and a mask of what it sees for each tick. Coordinates are CARLA's: left-handed, y to the
-south, degrees.
+A part is a directory of one episode (a *scenario* there), with a directory for each carrier of a LIDAR and, in it, a
+`.yaml`, a `.pcd`, a mask of what it sees and up to four images for each tick. A carrier beside the road has a negative
+number, as in V2XSet. The points of all LIDARs of a carrier are in one file, in the frame of the main one. Coordinates
+are CARLA's: left-handed, y to the south, degrees.
 """
 
 from __future__ import annotations
@@ -13,15 +14,50 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from caraware.data.export.scans import box_middle, forward_m, require_channels
-from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
+from caraware.data.export.frames import (
+    CameraImage,
+    DeliveredSensors,
+    Frame,
+    LidarScan,
+    delivered_sensors,
+    frames,
+)
+from caraware.data.export.scans import box_middle, projection, require_channels
+from caraware.data.export.sensors import Omission, lack_colours, left_out, left_out_without
+from caraware.data.recording import Array, Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array, FloatArray
+from caraware.ipc.mounts import ROADSIDE
 
 LABELLED_WITHIN_M = 150.0
 """Distance from the LIDAR up to which road users are labelled."""
 
 MASK_SIZE, MASK_MIDDLE, MASK_PIXEL_M = 256, 127, 0.39
 """Pixels of a side of `_bev_visibility.png`, the pixel of the LIDAR in both directions, and the length of one (m)."""
+
+
+MOST_CAMERAS = 4
+"""Cameras of an agent for which the format has a place."""
+
+
+def agent_number(carrier: int) -> int:
+    """Number of an agent: that of the vehicle, or −1, −2, … of the carriers beside the road."""
+    return -1 - (carrier & ~ROADSIDE) if carrier & ROADSIDE else carrier
+
+
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """OPV2V has a place for points and for the colours of four cameras, at ticks with a scan of the main LIDAR."""
+    main = delivered.main_lidar(carrier)
+    if main is None:
+        return left_out(delivered, carrier, delivered.of[carrier], "its carrier has no LIDAR, which an agent needs")
+    cameras = delivered.cameras(carrier)
+    kept = [*cameras[:MOST_CAMERAS], *(key for key in delivered.of[carrier] if key[0] == "lidar")]
+    radars = [key for key in delivered.of[carrier] if key[0] == "radar"]
+    return [
+        *(one for one in lack_colours(delivered, carrier) if one.sensor in kept),
+        *left_out(delivered, carrier, cameras[MOST_CAMERAS:], "OPV2V has a place for four cameras"),
+        *left_out(delivered, carrier, radars, "OPV2V has no place for radars"),
+        *left_out_without(delivered, carrier, kept, [main], "a tick needs a scan of the main LIDAR"),
+    ]
 
 
 def pose(position_m: Any, attitude_rad: Any) -> list[float]:
@@ -44,10 +80,27 @@ def world_from_pose(values: list[float]) -> Float64Array:
     )
 
 
-def _points(scan: np.void, points: Array) -> Array:
-    """f32 [count, 3]: points in the sensor's left-handed frame, x forward, y right, z up."""
-    left_handed: Array = forward_m(scan, points) * np.array([1, -1, 1], np.float32)
-    return left_handed
+def _sensor_pose(sensor: LidarScan | CameraImage) -> list[float]:
+    """OPV2V's pose of a sensor."""
+    return pose(sensor.head["position_m"], sensor.head["attitude_rad"])
+
+
+def merged_points(main: LidarScan, others: tuple[LidarScan, ...]) -> tuple[Array, Array, Array]:
+    """The points of several LIDARs in the left-handed frame of the main one, x forward, y right, z up.
+
+    f32 [count, 3] (m), f32 [count] intensities, u32 [count] objects.
+    """
+    right_handed_m: list[Array] = [main.forward_m]
+    for scan in others:
+        main_from_scan = np.linalg.inv(main.world_from_sensor) @ scan.world_from_sensor
+        moved_m = scan.forward_m.astype(np.float64) @ main_from_scan[:3, :3].T + main_from_scan[:3, 3]
+        right_handed_m.append(moved_m.astype(np.float32))
+    scans = (main, *others)
+    return (
+        np.concatenate(right_handed_m) * np.array([1, -1, 1], np.float32),
+        np.concatenate([scan.points["intensity"] for scan in scans]),
+        np.concatenate([scan.points["object"] for scan in scans]),
+    )
 
 
 def write_pcd(path: Path, position_m: Array, intensity: Array) -> None:
@@ -84,12 +137,12 @@ def mask_pixel(lidar_m: FloatArray) -> FloatArray:
     return MASK_MIDDLE + np.stack((lidar_m[:, 1], -lidar_m[:, 0]), 1) / MASK_PIXEL_M
 
 
-def _mask(scan: np.void, points: Array, states: Array) -> Image.Image:
-    """What the agent sees from above: 255 where a road user stands that its LIDAR has hit, else 0."""
-    world_from_lidar = world_from_pose(pose(scan["position_m"], scan["attitude_rad"]))
+def _mask(main: LidarScan, hit: Array, states: Array) -> Image.Image:
+    """What the agent sees from above: 255 where a road user stands that one of its LIDARs has hit, else 0."""
+    world_from_lidar = world_from_pose(_sensor_pose(main))
     image = Image.new("L", (MASK_SIZE, MASK_SIZE))
     draw = ImageDraw.Draw(image)
-    for state in states[np.isin(states["vehicle"], points["object"])]:
+    for state in states[np.isin(states["vehicle"], hit)]:
         box = _box(state)
         length_m, width_m, _ = box["extent"]
         corners = np.array([[x, y, 0, 1] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))], np.float64)
@@ -100,62 +153,71 @@ def _mask(scan: np.void, points: Array, states: Array) -> Image.Image:
     return image
 
 
-def _yaml(scan: np.void, points: Array, states: Array) -> str:
+def _camera(image: CameraImage, main: LidarScan) -> str:
+    """A camera in the `.yaml`: its pose, its pinhole, and the way from the LIDAR's frame to its own, both x forward."""
+    world_from_camera, world_from_lidar = (world_from_pose(_sensor_pose(sensor)) for sensor in (image, main))
+    parts = {
+        "cords": _sensor_pose(image),
+        "intrinsic": projection(image.head)[:, :3].tolist(),
+        "extrinsic": (np.linalg.inv(world_from_camera) @ world_from_lidar).tolist(),
+    }
+    return "".join(f"\n  {name}: {value}" for name, value in parts.items())
+
+
+def _yaml(frame: Frame, main: LidarScan, images: dict[int, CameraImage], hit_by: Array) -> str:
     """The `.yaml` of one agent and tick: poses, and every road user near it with the points that hit it."""
-    own = states[states["vehicle"] == scan["vehicle"]][0]
-    ego = _box(own)
-    hit, counts = np.unique(points["object"], return_counts=True)
+    states, scan = frame.states, main.head
+    ego = _box(frame.own)
+    hit, counts = np.unique(hit_by, return_counts=True)
     points_on = dict(zip(hit.tolist(), counts.tolist(), strict=True))
+    others = [state for state in states if _is_labelled(state, scan)]
     lines = [
-        "camera0: {}",
-        f"lidar_pose: {pose(scan['position_m'], scan['attitude_rad'])}",
+        *(f"camera{number}:{_camera(image, main)}" for number, image in sorted(images.items())),
+        *(["camera0: {}"] if 0 not in images else []),
+        f"lidar_pose: {_sensor_pose(main)}",
         f"true_ego_pos: {[*ego['location'], *ego['angle']]}",
         f"predicted_ego_pos: {[*ego['location'], *ego['angle']]}",
         f"ego_speed: {ego['speed']}",
+        f"RSU: {str(frame.is_roadside).lower()}",
         "plan_trajectory: []",
-        "vehicles:" if len(states) > 1 else "vehicles: {}",
+        "vehicles:" if others else "vehicles: {}",
     ]
-    for state in states:
-        away_m = np.hypot(state["x_m"] - scan["position_m"][0], state["y_m"] - scan["position_m"][1])
-        vehicle = int(state["vehicle"])
-        if vehicle == int(scan["vehicle"]) or away_m > LABELLED_WITHIN_M:
-            continue
-        lines.append(f"  {vehicle}:")
+    for state in others:
+        lines.append(f"  {int(state['vehicle'])}:")
         lines += [f"    {key}: {value}" for key, value in _box(state).items()]
         # Not in OPV2V: how many points of this agent are on it, so that labels can be masked by what it sees.
-        lines.append(f"    points: {points_on.get(vehicle, 0)}")
+        lines.append(f"    points: {points_on.get(int(state['vehicle']), 0)}")
     return "\n".join(lines) + "\n"
+
+
+def _is_labelled(state: np.void, scan: np.void) -> bool:
+    """True for a road user near the LIDAR that is not its carrier."""
+    away_m = np.hypot(state["x_m"] - scan["position_m"][0], state["y_m"] - scan["position_m"][1])
+    return int(state["vehicle"]) != int(scan["vehicle"]) and bool(away_m <= LABELLED_WITHIN_M)
 
 
 def write_opv2v(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world` or no `pointcloud`."""
     require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
-    world: dict[int, Array] = {}
-    scans: list[Message] = []
-    for message in recording.messages("world", "pointcloud"):
-        if int(message.header["episode"]) != episode.number:
-            continue
-        if message.channel == "world":
-            world[message.tick] = message.section("states")
-            continue
-        scans.append(message)
-        while scans and scans[0].tick in world:
-            _write_scan(path, scans.pop(0), world)
-        for tick in [tick for tick in world if tick < message.tick - 256]:
-            del world[tick]
-    for message in scans:
-        if message.tick in world:
-            _write_scan(path, message, world)
+    delivered = delivered_sensors(recording, episode)
+    for frame in frames(recording, episode, delivered):
+        if frame.main is not None:
+            cameras = delivered.cameras(frame.carrier)[:MOST_CAMERAS]
+            images = {cameras.index(image.key): image for image in frame.images if image.key in cameras}
+            _write_frame(path / str(agent_number(frame.carrier)), frame, frame.main, images)
     if not any(path.iterdir()):
-        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
+        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")
 
 
-def _write_scan(path: Path, message: Message, world: dict[int, Array]) -> None:
-    scan, points = message.section("scan")[0], message.section("points")
-    agent = path / str(int(scan["vehicle"]))
+def _write_frame(agent: Path, frame: Frame, main: LidarScan, images: dict[int, CameraImage]) -> None:
     agent.mkdir(exist_ok=True)
-    name = f"{message.tick:06}"
-    (agent / f"{name}.yaml").write_text(_yaml(scan, points, world[message.tick]), encoding="utf-8")
-    _mask(scan, points, world[message.tick]).save(agent / f"{name}_bev_visibility.png")
-    write_pcd(agent / f"{name}.pcd", _points(scan, points), points["intensity"])
+    name = f"{frame.tick:06}"
+    coloured = {number: (image, rgb) for number, image in images.items() if (rgb := image.rgb) is not None}
+    position_m, intensity, hit = merged_points(main, frame.other_scans)
+    described = {number: image for number, (image, _) in coloured.items()}
+    (agent / f"{name}.yaml").write_text(_yaml(frame, main, described, hit), encoding="utf-8")
+    _mask(main, hit, frame.states).save(agent / f"{name}_bev_visibility.png")
+    write_pcd(agent / f"{name}.pcd", position_m, intensity)
+    for number, (_, rgb) in coloured.items():
+        Image.fromarray(rgb).save(agent / f"{name}_camera{number}.png")

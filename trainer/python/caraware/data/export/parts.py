@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from caraware.data.export import fcd, foxglove, kitti, minari, nuscenes, opv2v, ros2, tables
+from caraware.data.export import detections, fcd, foxglove, kitti, minari, nuscenes, opv2v, ros2, streams, tables
+from caraware.data.export.sensors import Lacks, all_lack
 from caraware.data.recording import Episode, Recording, open_recording
 
 
@@ -23,43 +24,64 @@ class ExportFormat:
     meaning: str
     ending: str
     write: Callable[[Recording, Episode, Path], None]
+    lacks: Lacks
+    """What it has no place for."""
     join: Callable[[Recording, Path, list[str]], None] | None = None
     """Makes one data set of all parts in a directory, for formats that need it."""
+    has_observations: bool = False
+    """True if its rows or steps have observations."""
 
+
+ROWS_ALONE = all_lack("a row is a vehicle-tick, without points, images and detections (`--to radar` has these)")
 
 FORMATS = {
-    "parquet": ExportFormat("Parquet", tables.MEANING, "parquet", tables.write_parquet),
-    "csv": ExportFormat("CSV", tables.MEANING, "csv", tables.write_csv),
+    "parquet": ExportFormat(
+        "Parquet", tables.MEANING, "parquet", tables.write_parquet, ROWS_ALONE, has_observations=True
+    ),
+    "csv": ExportFormat("CSV", tables.MEANING, "csv", tables.write_csv, ROWS_ALONE, has_observations=True),
+    "radar": ExportFormat(
+        "radar detections (Parquet)",
+        detections.MEANING,
+        "radar.parquet",
+        detections.write_radar,
+        detections.lacks,
+    ),
     "fcd": ExportFormat(
         "SUMO floating car data",
         "Every road user at every tick, in SUMO's conventions: front bumper, degrees clockwise from north.",
         "fcd.xml",
         fcd.write_fcd,
+        all_lack("floating car data has no sensors"),
     ),
     "foxglove": ExportFormat(
         "Foxglove MCAP",
-        "Messages in Foxglove's schemas: transforms, boxes, true motion, GNSS, points and images.",
+        "Messages in Foxglove's schemas: transforms, boxes, true motion, GNSS, points, images and radar detections.",
         "foxglove.mcap",
         foxglove.write_foxglove,
+        streams.lacks,
     ),
     "kitti": ExportFormat(
         "KITTI",
-        "Objects: a directory for each vehicle with a LIDAR, with points, calibration, labels and images.",
+        "Objects: a directory for each carrier of a LIDAR, with points, calibration, labels and images.",
         "kitti",
         kitti.write_kitti,
+        kitti.lacks,
     ),
     "minari": ExportFormat(
         "Minari",
         "Offline reinforcement learning: a trajectory of observations, actions and rewards for each vehicle.",
         "minari",
         minari.write_minari,
+        all_lack("a step has the observation, the action and the reward"),
         minari.join_parts,
+        has_observations=True,
     ),
     "nuscenes": ExportFormat(
         "nuScenes",
-        "Perception: a scene for each vehicle with a LIDAR and each episode, with sweeps, images, poses and boxes.",
+        "Perception: a scene for each carrier of a LIDAR and episode, with sweeps, images, radar, poses and boxes.",
         "nuscenes",
         nuscenes.write_nuscenes,
+        nuscenes.lacks,
         nuscenes.join_parts,
     ),
     "opv2v": ExportFormat(
@@ -67,12 +89,14 @@ FORMATS = {
         "Cooperative perception: a directory for each agent with its points, poses and labels, in CARLA's frame.",
         "opv2v",
         opv2v.write_opv2v,
+        opv2v.lacks,
     ),
     "ros2": ExportFormat(
         "ROS 2 bag",
-        "A bag in MCAP with common messages: transforms, markers, odometry, GNSS, IMU, points and images.",
+        "A bag in MCAP with common messages: transforms, markers, odometry, GNSS, IMU, points, images and detections.",
         "ros2",
         ros2.write_ros2,
+        streams.lacks,
     ),
 }
 """Every format of `--to`."""

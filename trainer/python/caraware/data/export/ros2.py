@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -16,21 +17,34 @@ from caraware.data.export.card import source
 from caraware.data.export.scans import projection, quaternion
 from caraware.data.export.streams import (
     COLOURS,
-    POINT_FIELDS,
     WORLD,
     Box,
     Fix,
     Odometry,
     Placed,
+    SensorTopic,
     covariance,
-    packed_points,
     play,
 )
 from caraware.data.recording import Array, Episode, Recording
-from caraware.ipc.arrays import Float32Array, Float64Array
+from caraware.ipc.arrays import Float64Array
 
 BAG_VERSION: Literal[9] = 9
 """Version of rosbag2's metadata: that of ROS 2 Jazzy."""
+
+UNLIMITED = QosTime(9223372036, 854775807)
+KEPT = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    UNLIMITED,
+    UNLIMITED,
+    QosLiveliness.AUTOMATIC,
+    UNLIMITED,
+    avoid_ros_namespace_conventions=False,
+)
+"""Quality of service of `/tf_static`: a late subscriber gets the newest message."""
 
 
 class Ros2Sink:
@@ -46,10 +60,12 @@ class Ros2Sink:
         package, _, short = name.partition("/")
         return self._types.types[f"{package}/msg/{short}"](**fields)
 
-    def _write(self, topic: str, time_ns: int, message: Any) -> None:
+    def _write(self, topic: str, time_ns: int, message: Any, *, is_kept: bool = False) -> None:
         kind = message.__msgtype__
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._types)
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._types, offered_qos_profiles=[KEPT] if is_kept else ()
+            )
         self._writer.write(self._connections[topic], time_ns, self._types.serialize_cdr(message, kind))
 
     def _header(self, time_ns: int, frame: str) -> Any:
@@ -69,8 +85,8 @@ class Ros2Sink:
         position = self._make("geometry_msgs/Point", x=x, y=y, z=z)
         return self._make("geometry_msgs/Pose", position=position, orientation=self._quaternion(transform))
 
-    def transforms(self, time_ns: int, placed: list[Placed]) -> None:
-        """`/tf`: `tf2_msgs/TFMessage`."""
+    def transforms(self, time_ns: int, placed: list[Placed], *, are_static: bool = False) -> None:
+        """`/tf`: `tf2_msgs/TFMessage`; `/tf_static`, once for each frame and kept for late subscribers."""
         stamped = [
             self._make(
                 "geometry_msgs/TransformStamped",
@@ -84,7 +100,8 @@ class Ros2Sink:
             )
             for one in placed
         ]
-        self._write("/tf", time_ns, self._make("tf2_msgs/TFMessage", transforms=stamped))
+        topic = "/tf_static" if are_static else "/tf"
+        self._write(topic, time_ns, self._make("tf2_msgs/TFMessage", transforms=stamped), is_kept=are_static)
 
     def boxes(self, time_ns: int, boxes: list[Box]) -> None:
         """`/road_users`: `visualization_msgs/MarkerArray`, a cube for each, which ends with the tick."""
@@ -165,31 +182,30 @@ class Ros2Sink:
         )
         self._write(f"/{vehicle}/imu", time_ns, message)
 
-    def points(self, time_ns: int, vehicle: str, position_m: Float32Array, points: Array) -> None:
-        """`/vehicle_N/lidar`: `sensor_msgs/PointCloud2`."""
-        packed = packed_points(position_m, points)
+    def points(self, time_ns: int, place: SensorTopic, points: Array) -> None:
+        """The topic of a LIDAR or a radar: `sensor_msgs/PointCloud2`."""
         types = {"<f4": 7, "<u4": 6, "<u2": 4}  # PointField.FLOAT32, UINT32, UINT16
         fields = [
-            self._make("sensor_msgs/PointField", name=name, offset=offset, datatype=types[scalar], count=1)
-            for name, (scalar, offset) in POINT_FIELDS.items()
+            self._make("sensor_msgs/PointField", name=name, offset=offset, datatype=types[scalar.str], count=1)
+            for name, (scalar, offset, *_) in (points.dtype.fields or {}).items()
         ]
         message = self._make(
             "sensor_msgs/PointCloud2",
-            header=self._header(time_ns, f"{vehicle}/lidar"),
+            header=self._header(time_ns, place.frame),
             height=1,
-            width=len(packed),
+            width=len(points),
             fields=fields,
             is_bigendian=False,
-            point_step=packed.itemsize,
-            row_step=packed.nbytes,
-            data=np.frombuffer(packed.tobytes(), np.uint8),
+            point_step=points.itemsize,
+            row_step=points.nbytes,
+            data=np.frombuffer(points.tobytes(), np.uint8),
             is_dense=True,
         )
-        self._write(f"/{vehicle}/lidar", time_ns, message)
+        self._write(place.topic, time_ns, message)
 
-    def image(self, time_ns: int, vehicle: str, png: bytes, head: np.void) -> None:
-        """`/vehicle_N/camera/compressed`: `sensor_msgs/CompressedImage`; `/vehicle_N/camera_info`: its calibration."""
-        header, matrix = self._header(time_ns, f"{vehicle}/camera_optical"), projection(head)
+    def image(self, time_ns: int, place: SensorTopic, png: bytes, head: np.void) -> None:
+        """The topic of a camera below `/compressed`: `sensor_msgs/CompressedImage`; that of its `CameraInfo`."""
+        header, matrix = self._header(time_ns, place.frame), projection(head)
         whole = self._make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         image = self._make(
             "sensor_msgs/CompressedImage",
@@ -211,8 +227,8 @@ class Ros2Sink:
             binning_y=0,
             roi=whole,
         )
-        self._write(f"/{vehicle}/camera/compressed", time_ns, image)
-        self._write(f"/{vehicle}/camera_info", time_ns, info)
+        self._write(f"{place.topic}/compressed", time_ns, image)
+        self._write(f"{place.calibration}info", time_ns, info)
 
 
 def write_ros2(recording: Recording, episode: Episode, path: Path) -> None:

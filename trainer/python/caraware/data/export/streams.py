@@ -2,12 +2,14 @@
 
 Frames are those of REP 105 and REP 103: `map` is the world (x east, y north, z up); `vehicle_N/base_link` is the rear
 axle's centre on the ground (x forward, y left, z up), with the sensors below it; optical frames have z forward. `N` is
-the dense index of a vehicle in its episode. Times are simulated, since the start of the run.
+the dense index of a vehicle in its episode. Carriers beside the road are `roadside_K/base_link`, whose frames are
+static. Times are simulated, since the start of the run.
 """
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from heapq import merge
@@ -17,22 +19,23 @@ import numpy as np
 from PIL import Image
 
 from caraware import _native
-from caraware.data.export.scans import (
-    OPTICAL,
+from caraware.data.export.frames import (
+    CameraImage,
+    DeliveredSensors,
     Frame,
-    box_middle,
-    forward_m,
+    LidarScan,
+    RadarSample,
+    SensorMessage,
+    delivered_sensors,
     frames,
-    inverse,
-    require_channels,
-    rotated,
-    upright_pose,
-    vehicle_pose,
 )
+from caraware.data.export.scans import box_middle, inverse, require_channels, upright_pose, vehicle_pose
+from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours
 from caraware.data.names import Kind, RoadUsers
 from caraware.data.recording import Array, Episode, Message, Recording
-from caraware.ipc.arrays import Float32Array, Float64Array
+from caraware.ipc.arrays import Float64Array
 from caraware.ipc.layout import SENSOR_BITS
+from caraware.ipc.mounts import OWN_SENSOR
 from caraware.ipc.pointcloud import rotation
 
 WORLD = "map"
@@ -49,16 +52,25 @@ COLOURS = {
 }
 """Red, green and blue of the boxes, 0 … 1."""
 
-POINT_FIELDS = {
-    "x": ("<f4", 0),
-    "y": ("<f4", 4),
-    "z": ("<f4", 8),
-    "intensity": ("<f4", 12),
-    "object": ("<u4", 16),
-    "age_us": ("<u4", 20),
-    "ring": ("<u2", 24),
-}
-"""Scalar and place (bytes) of the fields of a point: `object` is what it is on, `age_us` the time before the scan's."""
+POINT = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "intensity")),
+        *(("object", "<u4"), ("age_us", "<u4"), ("ring", "<u2")),
+    ]
+)
+"""A point of a LIDAR: `object` is what it is on, `age_us` the time before the scan's, `ring` that of its laser."""
+
+DETECTION = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "distance_m", "azimuth_rad", "elevation_rad")),
+        *((name, "<f4") for name in ("radial_velocity_mps", "rcs_dbsm", "snr_db", "existence_probability")),
+        ("object_id", "<u4"),
+    ]
+)
+"""A detection of a radar: its place, and the values of `RadarDetection` with their names and signs."""
+
+RESERVED = ("base_link", "truth", "gnss", "imu", "camera_optical", "camera_info", "camera_calibration")
+"""Names below a vehicle that no sensor of a suite gets."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +111,18 @@ class Odometry:
 
 
 @dataclass(frozen=True)
+class SensorTopic:
+    """Where the messages of a sensor go."""
+
+    frame: str
+    """Name of its frame."""
+    topic: str
+    """Topic of its points, detections or images."""
+    calibration: str
+    """Of a camera: begin of the topic of its calibration, which a format completes."""
+
+
+@dataclass(frozen=True)
 class Fix:
     """A GNSS fix."""
 
@@ -112,8 +136,8 @@ class Fix:
 class Sink(Protocol):
     """What writes the messages. Times are in nanoseconds; topics and frames begin with the name of the vehicle."""
 
-    def transforms(self, time_ns: int, placed: list[Placed]) -> None:
-        """Frames at a time."""
+    def transforms(self, time_ns: int, placed: list[Placed], *, are_static: bool = False) -> None:
+        """Frames at a time; static ones hold from then on."""
 
     def boxes(self, time_ns: int, boxes: list[Box]) -> None:
         """Every road user, in the world frame."""
@@ -127,11 +151,11 @@ class Sink(Protocol):
     def imu(self, time_ns: int, vehicle: str, accel_mps2: Array, rate_radps: Array) -> None:
         """A sample of a vehicle's accelerometer, gravity included, and of its gyroscope: f32 [3] each."""
 
-    def points(self, time_ns: int, vehicle: str, position_m: Float32Array, points: Array) -> None:
-        """A scan in `VEHICLE/lidar`: f32 [count, 3], and the recorded points (`LidarPoint`)."""
+    def points(self, time_ns: int, place: SensorTopic, points: Array) -> None:
+        """The points of a LIDAR (`POINT [count]`) or the detections of a radar (`DETECTION [count]`) in its frame."""
 
-    def image(self, time_ns: int, vehicle: str, png: bytes, head: np.void) -> None:
-        """An image in `VEHICLE/camera_optical`, and its camera (`ImageHead`)."""
+    def image(self, time_ns: int, place: SensorTopic, png: bytes, head: np.void) -> None:
+        """An image in an optical frame, and its camera (`ImageHead`)."""
 
 
 def play(recording: Recording, episode: Episode, sink: Sink) -> None:
@@ -139,21 +163,20 @@ def play(recording: Recording, episode: Episode, sink: Sink) -> None:
     require_channels(recording, "world")
     users, tick_ns = RoadUsers(recording), round(recording.tick_s * 1e9)
     convention = str(recording.run["config"]["imu"]["convention"])
-    scans: Iterator[Frame] = iter(())
-    if "pointcloud" in recording.channels:
-        scans = frames(recording, episode, every_scan=True)
+    sensors = _Sensors(recording, sink)
     messages = (
         message
         for message in recording.messages("world", "observation")
         if int(message.header["episode"]) == episode.number
     )
+    sensed = frames(recording, episode, delivered_sensors(recording, episode))
     # A channel may be some ticks ahead of another, so the order is nearly that of ticks.
-    ordered: Iterator[Message | Frame] = merge(messages, scans, key=_tick)
+    ordered: Iterator[Message | Frame] = merge(messages, sensed, key=lambda item: item.tick)
     states: dict[int, Array] = {}
     waiting: dict[int, Message] = {}
     for item in ordered:
         if isinstance(item, Frame):
-            _sensed(item, item.scan.tick * tick_ns, sink)
+            sensors.play(item, item.tick * tick_ns)
         elif item.channel == "world":
             states[item.tick] = item.section("states")
             sink.boxes(item.tick * tick_ns, [_box(state, users) for state in states[item.tick]])
@@ -165,23 +188,29 @@ def play(recording: Recording, episode: Episode, sink: Sink) -> None:
                 del states[old]
 
 
-def _tick(item: Message | Frame) -> int:
-    return item.tick if isinstance(item, Message) else item.scan.tick
+def lacks(delivered: DeliveredSensors, carrier: int) -> list[Omission]:
+    """Every sensor has topics; images have colours alone."""
+    return lack_colours(delivered, carrier)
 
 
-def name_of(vehicle: int) -> str:
-    """Name of a vehicle in topics and frames."""
-    return f"vehicle_{vehicle}"
+def packed_points(scan: LidarScan) -> Array:
+    """`POINT [count]`, without gaps."""
+    packed, forward_m = np.zeros(len(scan.points), POINT), scan.forward_m
+    for place, name in enumerate("xyz"):
+        packed[name] = forward_m[:, place]
+    for name in ("intensity", "object", "age_us"):
+        packed[name] = scan.points[name]
+    packed["ring"] = scan.points["channel"]
+    return packed
 
 
-def packed_points(position_m: Float32Array, points: Array) -> Array:
-    """[count] of `POINT_FIELDS`, without gaps."""
-    packed = np.zeros(len(points), [(name, scalar) for name, (scalar, _) in POINT_FIELDS.items()])
+def packed_detections(radar: RadarSample) -> Array:
+    """`DETECTION [count]`, without gaps."""
+    packed, position_m = np.zeros(len(radar.detections), DETECTION), radar.position_m
     for place, name in enumerate("xyz"):
         packed[name] = position_m[:, place]
-    for name in ("intensity", "object", "age_us"):
-        packed[name] = points[name]
-    packed["ring"] = points["channel"]
+    for name in (DETECTION.names or ())[3:]:
+        packed[name] = radar.detections[name]
     return packed
 
 
@@ -203,21 +232,57 @@ def _box(state: np.void, users: RoadUsers) -> Box:
     )
 
 
-def _sensed(frame: Frame, time_ns: int, sink: Sink) -> None:
-    """The scan of the first LIDAR, the image of the main camera, and where both are on their carrier."""
-    vehicle = name_of(frame.carrier)
-    base, vehicle_from_world = f"{vehicle}/base_link", inverse(vehicle_pose(frame.own))
-    placed = [Placed(base, f"{vehicle}/lidar", vehicle_from_world @ frame.world_from_lidar)]
-    image = frame.images[0] if frame.images else None
-    if image is not None:
-        optical = image.world_from_camera @ rotated(OPTICAL.T)
-        placed.append(Placed(base, f"{vehicle}/camera_optical", vehicle_from_world @ optical))
-    sink.transforms(time_ns, placed)
-    sink.points(time_ns, vehicle, forward_m(frame.head, frame.points).astype(np.float32), frame.points)
-    if image is not None and (rgb := image.rgb) is not None:
-        png = io.BytesIO()
-        Image.fromarray(rgb).save(png, "png")
-        sink.image(time_ns, vehicle, png.getvalue(), image.head)
+class _Sensors:
+    """Plays frames: where the sensors are on their carrier, and what they delivered."""
+
+    def __init__(self, recording: Recording, sink: Sink) -> None:
+        self._labels = SensorLabels(recording.run, _label, RESERVED)
+        self._sink = sink
+        # Vehicles are placed with their observations, where these are recorded.
+        self._places_vehicles = "observation" not in recording.channels
+        self._standing: dict[str, Placed] = {}
+
+    def play(self, frame: Frame, time_ns: int) -> None:
+        """Play a frame."""
+        base = f"{carrier_name(frame.carrier)}/base_link"
+        world_from_base = vehicle_pose(frame.own)
+        placed = []
+        if frame.is_roadside or self._places_vehicles:
+            placed.append(Placed(WORLD, base, world_from_base))
+        for sensor in frame.sensors:
+            world_from = sensor.world_from_optical if isinstance(sensor, CameraImage) else sensor.world_from_sensor
+            placed.append(Placed(base, self._topic(frame, sensor).frame, inverse(world_from_base) @ world_from))
+        if not frame.is_roadside:
+            self._sink.transforms(time_ns, placed)
+        elif any(one.child not in self._standing for one in placed):
+            # A message has all static frames so far: a late subscriber may get the last message alone.
+            self._standing = {one.child: one for one in placed} | self._standing
+            self._sink.transforms(time_ns, list(self._standing.values()), are_static=True)
+        for scan in frame.scans:
+            self._sink.points(time_ns, self._topic(frame, scan), packed_points(scan))
+        for radar in frame.radars:
+            self._sink.points(time_ns, self._topic(frame, radar), packed_detections(radar))
+        for image in frame.images:
+            if (rgb := image.rgb) is not None:
+                png = io.BytesIO()
+                Image.fromarray(rgb).save(png, "png")
+                self._sink.image(time_ns, self._topic(frame, image), png.getvalue(), image.head)
+
+    def _topic(self, frame: Frame, sensor: SensorMessage) -> SensorTopic:
+        """`CARRIER/lidar` of the sensor of a section; a sensor of a suite has topics below its own name."""
+        carrier, (kind, number) = carrier_name(frame.carrier), sensor.key
+        label = self._labels.of(sensor.key)
+        optical = f"{carrier}/{label}_optical" if kind == "camera" else f"{carrier}/{label}"
+        if number == OWN_SENSOR:
+            return SensorTopic(optical, f"/{carrier}/{label}", f"/{carrier}/{label}_")
+        leaf = {"lidar": "points", "camera": "image", "radar": "detections"}[kind]
+        return SensorTopic(optical, f"/{carrier}/{label}/{leaf}", f"/{carrier}/{label}/camera_")
+
+
+def _label(kind: str, name: str) -> str:
+    """A name as ROS allows it: letters, digits and underscores, no digit first."""
+    label = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return label if label[:1].isalpha() else f"{kind}_{label}"
 
 
 def _observed(message: Message, states: Array, convention: str, tick_ns: int, sink: Sink) -> None:
@@ -231,7 +296,7 @@ def _observed(message: Message, states: Array, convention: str, tick_ns: int, si
     for number, sensors, geodetic, quality, imu in rows:
         if int(number) == _native.EMPTY_SLOT or int(number) not in by_vehicle:
             continue
-        state, vehicle = by_vehicle[int(number)], name_of(int(number))
+        state, vehicle = by_vehicle[int(number)], carrier_name(int(number))
         here = Placed(WORLD, f"{vehicle}/base_link", vehicle_pose(state))
         placed.append(here)
         velocity, rate = (state[name].astype(np.float64) for name in ("velocity_body_mps", "angular_rate_body_radps"))
