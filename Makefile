@@ -5,6 +5,8 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 VENV := .venv
 PYTHON310 ?= python3.10
 CARGO_FLAGS := --release --locked
+# Cargo looks for a job server of make where there is none.
+CARGO := MAKEFLAGS= cargo
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 # 1 installs CUDA's libraries, which torch asks for and which need 4 GB. Without a driver none is called: see scripts/without_cuda.py.
@@ -42,12 +44,12 @@ timed-programs:
 	@scripts/stages.sh time "beside them programs" $(MAKE) --no-print-directory programs
 
 programs:
-	cargo build $(CARGO_FLAGS)
+	$(CARGO) build $(CARGO_FLAGS)
 
 # One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
 # them again.
 programs-and-tests:
-	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
+	$(CARGO) build $(CARGO_FLAGS) --lib --bins --tests --examples
 
 # `install` replaces the file, so that a trainer that runs keeps the one it has loaded.
 EXTENSION = install -m 755 target/release/lib_native.so trainer/python/caraware/_native.abi3.so
@@ -105,9 +107,9 @@ image: ## a container image of Containerfile, by podman, buildah or docker
 	scripts/image.sh caraware GPU=$(GPU)
 
 # A test thread more than cores: most tests start whole runs, which wait for each other much of the time. No crate has documentation
-# tests. Cargo is no make: without MAKEFLAGS it does not look for a job server.
+# tests.
 test-rust: programs-and-tests
-	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} MAKEFLAGS= cargo test $(CARGO_FLAGS) --no-fail-fast --tests
+	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} $(CARGO) test $(CARGO_FLAGS) --no-fail-fast --tests
 
 # One pytest each: test modules of different packages may share names.
 test-python:
@@ -120,7 +122,7 @@ test-python:
 
 # The tests look at fewer deaths, preemptions and frames. Miri needs a nightly toolchain: rustup toolchain install nightly --component miri,rust-src
 model: prerequisites $(VENV)/.installed ## the models and the parsers for longer than in the tests, the unsafe parts under Miri: about an hour
-	CARAWARE_MODEL_DEATHS=3,3 cargo test $(CARGO_FLAGS) --test protocol_model
+	CARAWARE_MODEL_DEATHS=3,3 $(CARGO) test $(CARGO_FLAGS) --test protocol_model
 	CARAWARE_LOOM_PREEMPTIONS=4 cargo test $(CARGO_FLAGS) --test boards_under_loom
 	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test hostile_frames
 	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test messages
@@ -135,7 +137,7 @@ lint: lint-rust lint-python ## formatting and lints, as errors
 
 lint-rust: prerequisites $(VENV)/.sumo
 	cargo fmt --all --check
-	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
+	$(CARGO) clippy $(CARGO_FLAGS) --all-targets -- -D warnings
 
 lint-python: $(VENV)/.installed
 	$(VENV)/bin/ruff check trainer viewer bench
