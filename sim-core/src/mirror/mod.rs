@@ -496,12 +496,18 @@ impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
             next.1.fetch(sub_step, per_tick);
             next.2.fetch(sub_step, per_tick);
         });
+        self.batch
+            .write_all(self.loaded.iter().map(|(_, row)| row * per_tick), rows);
         for (member, (place, row)) in self.loaded.drain(..).enumerate() {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
             let (road_user, out) = (&mut context.slab[place as usize], &mut states[row]);
             let set = road_user.store(tick, context.settings, &self.batch, member, out, sub_steps);
-            context.resynchronised.extend(set);
-            context.guidances.extend(road_user.guidance(out));
+            if let Some(set) = set {
+                context.resynchronised.push(set);
+            }
+            if let Some(guidance) = road_user.guidance(out) {
+                context.guidances.push(guidance);
+            }
             context.tracking.add(out);
         }
     }
