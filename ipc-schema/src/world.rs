@@ -186,9 +186,24 @@ pub struct HeroView {
     pub around: [f32; AROUND],
 }
 
+impl HeroView {
+    /// Nothing is in sight.
+    pub const NONE: Self = Self {
+        route_m: [[0.0; 2]; 4],
+        speed_limit_mps: 0.0,
+        route_offset_m: 0.0,
+        route_left_m: 0.0,
+        leader_gap_m: 0.0,
+        leader_speed_mps: 0.0,
+        signal_gap_m: 0.0,
+        vehicle: 0,
+        around: [0.0; AROUND],
+    };
+}
+
 impl Default for HeroView {
     fn default() -> Self {
-        Self::zeroed()
+        Self::NONE
     }
 }
 

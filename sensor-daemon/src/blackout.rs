@@ -61,8 +61,18 @@ impl BlackoutSchedule {
         }
     }
 
-    /// Advances to `now_ns`.
-    pub fn advance(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) {
+    /// Advances to `now_ns`. Returns true if a gap or a blackout has ended.
+    #[inline]
+    pub fn advance(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) -> bool {
+        let has_ended = now_ns >= phase.until_ns;
+        if has_ended {
+            self.pass(phase, episode_seed, id_hash, now_ns);
+        }
+        has_ended
+    }
+
+    /// Passes over the gaps and blackouts that have ended by `now_ns`.
+    fn pass(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) {
         while now_ns >= phase.until_ns {
             phase.number = phase.number.wrapping_add(1);
             let [place, _] = self
@@ -151,7 +161,9 @@ mod tests {
         let later = schedule.begin(5, 3, 70, 0);
         assert_ne!(schedule.begin(5, 3, 0, 0).until_ns, later.until_ns);
         let (mut often, mut once) = (later, later);
-        (0..1000).for_each(|tick| schedule.advance(&mut often, 5, 3, tick * TICK_NS));
+        for tick in 0..1000 {
+            schedule.advance(&mut often, 5, 3, tick * TICK_NS);
+        }
         schedule.advance(&mut once, 5, 3, 999 * TICK_NS);
         assert_eq!(often, once);
         assert!(often.number > 10);

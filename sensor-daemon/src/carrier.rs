@@ -20,8 +20,10 @@ pub struct SensorCarrier {
     pub walk: ImuAxes,
     /// Constant scale factors of its speed and steering angle.
     pub scales: SpeedSteeringScales,
-    /// Position of each sensor in its sequence of blackouts.
+    /// Position of each sensor in its sequence of blackouts; of those that have none, the start.
     pub phases: [BlackoutPhase; SensorKind::COUNT],
+    /// Sensors that are in a blackout, by their phases.
+    pub blacked_out: u32,
     /// Step of the newest sample of each sensor.
     pub sampled: [u32; SensorKind::COUNT],
     /// Sensors that the road user has.
@@ -56,6 +58,7 @@ impl SensorCarrier {
             walk,
             scales,
             phases: [BlackoutPhase::default(); SensorKind::COUNT],
+            blacked_out: 0,
             sampled: [0; SensorKind::COUNT],
             present,
             own: present,
@@ -71,10 +74,7 @@ impl SensorCarrier {
     #[must_use]
     #[inline(always)]
     pub fn awake(&self) -> u32 {
-        let awake = SensorKind::ALL
-            .into_iter()
-            .filter(|kind| !self.phases[kind.index()].is_dark());
-        awake.fold(0, |bits, kind| bits | kind.bit()) & self.present & !self.off
+        self.present & !(self.off | self.blacked_out)
     }
 
     /// Records a sample of `sensor` at `step`.
@@ -93,14 +93,16 @@ impl SensorCarrier {
             !SensorKind::Gnss.bit()
         };
         self.readings.delivering = self.awake() & fix & self.known;
-        for sensor in SensorKind::ALL {
-            let sampled = self.sampled[sensor.index()];
+        // The ages of the sensors that it lacks stay 0.
+        let mut present = self.present;
+        while present != 0 {
+            let sensor = present.trailing_zeros() as usize % SensorKind::COUNT;
+            present &= present - 1;
+            let sampled = self.sampled[sensor];
             // Most are fresh.
-            let is_old = sensor.is_in(self.present) && sampled != step;
-            self.readings.ages_s[sensor.index()] = if is_old {
-                (f64::from(step - sampled) * tick_s) as f32
-            } else {
-                0.0
+            self.readings.ages_s[sensor] = match sampled == step {
+                true => 0.0,
+                false => (f64::from(step - sampled) * tick_s) as f32,
             };
         }
     }

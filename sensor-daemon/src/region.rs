@@ -36,7 +36,12 @@ impl SensedRegion {
 
     /// True if (`x_m`, `y_m`) is inside.
     #[must_use]
+    #[inline]
     pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
+        matches!(self, Self::All) || self.encloses(x_m, y_m)
+    }
+
+    fn encloses(&self, x_m: f64, y_m: f64) -> bool {
         match self {
             Self::All => true,
             Self::Circle { centre_m, radius_m } => (x_m - centre_m[0]).hypot(y_m - centre_m[1]) <= *radius_m,

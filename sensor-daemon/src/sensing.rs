@@ -261,26 +261,29 @@ impl Sensing {
         self.row_of_slot.fill(None);
         let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {
-            if self.is_sensed(state) && !self.region.contains(state.x_m, state.y_m) {
+            if !self.is_sensed(state) {
+                continue;
+            }
+            if !self.region.contains(state.x_m, state.y_m) {
                 // It continues outside the sensed region: its trajectory is cut here, and a new one begins when it returns.
                 self.slots.cut_vehicle(state.vehicle);
-            } else if self.is_sensed(state) {
-                let slot = self.slots.occupy(state.vehicle);
-                if is_cut(state) {
-                    self.slots.cut(slot);
-                }
-                if self.agents == Kind::Hero {
-                    self.slots.note_end(slot, end_bits(state.flags & HERO_ENDS));
-                }
-                if state.flags & RESYNCHRONISED != 0 {
-                    self.slots.restart(slot);
-                }
-                if slot >= self.row_of_slot.len() {
-                    self.row_of_slot.resize(slot + 1, None);
-                }
-                self.row_of_slot[slot] = Some(row);
-                self.update_carrier(slot, state, &now);
+                continue;
             }
+            let slot = self.slots.occupy(state.vehicle);
+            if is_cut(state) {
+                self.slots.cut(slot);
+            }
+            if self.agents == Kind::Hero {
+                self.slots.note_end(slot, end_bits(state.flags & HERO_ENDS));
+            }
+            if state.flags & RESYNCHRONISED != 0 {
+                self.slots.restart(slot);
+            }
+            if slot >= self.row_of_slot.len() {
+                self.row_of_slot.resize(slot + 1, None);
+            }
+            self.row_of_slot[slot] = Some(row);
+            self.update_carrier(slot, state, &now);
         }
         self.slots.end();
         Ok(self.slots.rows().len())
@@ -407,11 +410,12 @@ impl Sensing {
         let mut draws = std::mem::take(&mut self.draws);
         draws.clear();
         self.suite().plan(&mut draws, &now);
+        let sub_steps = world.sub_steps.len().checked_div(world.states.len()).unwrap_or(0);
         for first in (0..n).step_by(BATCH) {
             let ids = std::array::from_fn(|member| self.id_hash(first + member, world));
             draws.draw(now.episode_seed, &ids);
             for slot in first..n.min(first + BATCH) {
-                self.sense(slot, world, &now, draws.of(slot - first), &mut sections);
+                self.sense(slot, (world, sub_steps), &now, draws.of(slot - first), &mut sections);
             }
         }
         self.draws = draws;
@@ -426,11 +430,12 @@ impl Sensing {
         }
     }
 
-    /// Samples and writes one slot with the numbers drawn for it.
+    /// Samples and writes one slot, whose road user has `per` sub-steps in the world, with the numbers drawn for it.
+    #[inline]
     fn sense(
         &mut self,
         slot: usize,
-        world: &WorldTick,
+        (world, per): (&WorldTick, usize),
         now: &TickTime,
         drawn: DrawnNormals,
         out: &mut ObservationSections,
@@ -444,7 +449,6 @@ impl Sensing {
         let row = row as usize;
         let state = &world.states[row];
         let alone;
-        let per = world.sub_steps.len() / world.states.len();
         let rows = if per == 0 {
             alone = [sub_step(state)];
             &alone
@@ -461,7 +465,7 @@ impl Sensing {
         self.suites[self.at].suite.sample(carrier, &motion, now, drawn, samples);
         // `views` are in ascending order of the vehicle.
         if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
-            carrier.readings.route = world.views[place];
+            carrier.readings.set_route(&world.views[place]);
         }
         self.write(slot, state, lent.step, out);
     }

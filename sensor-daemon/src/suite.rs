@@ -29,7 +29,8 @@ pub struct SensorSuite {
     sky: Option<Box<dyn SatelliteSky>>,
     imu: ImuModel,
     speed_steering: SpeedSteeringModel,
-    schedules: [Option<BlackoutSchedule>; SensorKind::COUNT],
+    /// Those of the sensors that have blackouts.
+    schedules: Vec<(SensorKind, BlackoutSchedule)>,
     /// Ticks between two samples of each sensor.
     periods: [u32; SensorKind::COUNT],
     /// Number of vehicles that carry each sensor of a section: those in the first slots.
@@ -108,17 +109,16 @@ impl SensorSuite {
             self.gnss.begin(is_person, now.episode_seed, state.id_hash),
             self.imu.begin(now.episode_seed, state.id_hash),
             self.speed_steering.begin(now.episode_seed, state.id_hash),
-            self.unsensed,
+            self.unsensed.clone(),
         );
         if !is_person {
             carrier.suite = self.mounted.suite_of(state.flags, slot);
             carrier.present |= self.mounted.kinds(carrier.suite);
             carrier.arms = self.mounted.arms(carrier.suite);
         }
-        for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
-            if let Some(schedule) = schedule {
-                *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
-            }
+        // No road user appears in a blackout.
+        for (kind, schedule) in &self.schedules {
+            carrier.phases[kind.index()] = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
         }
         carrier
     }
@@ -126,9 +126,11 @@ impl SensorSuite {
     /// Advances the blackouts of a carrier's sensors to this tick.
     #[inline]
     pub fn advance(&self, carrier: &mut SensorCarrier, id_hash: u64, now: &TickTime) {
-        for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
-            if let Some(schedule) = schedule {
-                schedule.advance(phase, now.episode_seed, id_hash, now.time_ns);
+        for (kind, schedule) in &self.schedules {
+            let phase = &mut carrier.phases[kind.index()];
+            if schedule.advance(phase, now.episode_seed, id_hash, now.time_ns) {
+                let others = carrier.blacked_out & !kind.bit();
+                carrier.blacked_out = others | if phase.is_dark() { kind.bit() } else { 0 };
             }
         }
     }
@@ -249,10 +251,11 @@ impl SensorSuite {
     }
 }
 
-fn schedules(config: &Config, tick_ns: u64) -> [Option<BlackoutSchedule>; SensorKind::COUNT] {
-    SENSORS.map(|spec| {
-        let spans = (spec.blackouts)(config);
-        let schedule = || BlackoutSchedule::new(spec.blackout_noise, spans, tick_ns);
-        config.blackout.enabled.then(schedule).flatten()
-    })
+fn schedules(config: &Config, tick_ns: u64) -> Vec<(SensorKind, BlackoutSchedule)> {
+    let specs = SENSORS.iter().filter(|_| config.blackout.enabled);
+    let schedules = specs.filter_map(|spec| {
+        let schedule = BlackoutSchedule::new(spec.blackout_noise, (spec.blackouts)(config), tick_ns);
+        Some((spec.kind, schedule?))
+    });
+    schedules.collect()
 }

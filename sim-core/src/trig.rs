@@ -65,10 +65,17 @@ pub fn pick(condition: bool, yes: f64, no: f64) -> f64 {
 
 /// The same angle in (-π, π].
 #[must_use]
+#[inline]
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     if angle_rad > -PI && angle_rad <= PI {
         return angle_rad;
     }
+    unwind(angle_rad)
+}
+
+/// Takes whole turns from an angle: few angles have one.
+#[cold]
+fn unwind(angle_rad: f64) -> f64 {
     let wrapped = angle_rad - TAU * libm::ceil((angle_rad - PI) / TAU);
     wrapped.clamp(-PI, PI)
 }

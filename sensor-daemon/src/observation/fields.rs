@@ -9,7 +9,7 @@ use ipc_schema::{
 use crate::{sensors::gnss::GnssFix, sensors::imu, sensors::speed_steering, sensors::ultrasonic::UltrasonicRanges};
 
 /// The newest samples of one vehicle's sensors.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct SensorReadings {
     /// GNSS.
     pub fix: GnssFix,
@@ -25,9 +25,12 @@ pub struct SensorReadings {
     pub ages_s: [f32; SensorKind::COUNT],
     /// Bits of the sensors that deliver.
     pub delivering: u32,
-    /// Route and traffic ahead of a hero.
-    pub route: HeroView,
+    /// Route and traffic ahead of a hero. Only heroes have it: it is larger than everything else that a carrier keeps.
+    pub route: Option<Box<HeroView>>,
 }
+
+/// What a road user without a route sees of it.
+static NO_VIEW: HeroView = HeroView::NONE;
 
 impl SensorReadings {
     /// Readings of a carrier whose sensors have not sampled yet, and of the sensors that it lacks: no object is in sight, and no echo is heard.
@@ -38,6 +41,18 @@ impl SensorReadings {
             ultrasonic_m: [config.ultrasonic.range_m as f32; ULTRASONIC_MOUNTS],
             ..Self::default()
         }
+    }
+
+    /// Sets route and traffic ahead.
+    pub fn set_route(&mut self, view: &HeroView) {
+        match &mut self.route {
+            Some(route) => **route = *view,
+            None => self.route = Some(Box::new(*view)),
+        }
+    }
+
+    fn view(&self) -> &HeroView {
+        self.route.as_deref().unwrap_or(&NO_VIEW)
     }
 
     #[inline(always)]
@@ -71,20 +86,20 @@ impl SensorReadings {
             Field::Object3Y => f64::from(self.objects_m[2][1]),
             Field::Object4X => f64::from(self.objects_m[3][0]),
             Field::Object4Y => f64::from(self.objects_m[3][1]),
-            Field::RouteX5 => f64::from(self.route.route_m[0][0]),
-            Field::RouteY5 => f64::from(self.route.route_m[0][1]),
-            Field::RouteX10 => f64::from(self.route.route_m[1][0]),
-            Field::RouteY10 => f64::from(self.route.route_m[1][1]),
-            Field::RouteX20 => f64::from(self.route.route_m[2][0]),
-            Field::RouteY20 => f64::from(self.route.route_m[2][1]),
-            Field::RouteX40 => f64::from(self.route.route_m[3][0]),
-            Field::RouteY40 => f64::from(self.route.route_m[3][1]),
-            Field::SpeedLimit => f64::from(self.route.speed_limit_mps),
-            Field::RouteOffset => f64::from(self.route.route_offset_m),
-            Field::RouteLeft => f64::from(self.route.route_left_m),
-            Field::LeaderGap => f64::from(self.route.leader_gap_m),
-            Field::LeaderSpeed => f64::from(self.route.leader_speed_mps),
-            Field::SignalGap => f64::from(self.route.signal_gap_m),
+            Field::RouteX5 => f64::from(self.view().route_m[0][0]),
+            Field::RouteY5 => f64::from(self.view().route_m[0][1]),
+            Field::RouteX10 => f64::from(self.view().route_m[1][0]),
+            Field::RouteY10 => f64::from(self.view().route_m[1][1]),
+            Field::RouteX20 => f64::from(self.view().route_m[2][0]),
+            Field::RouteY20 => f64::from(self.view().route_m[2][1]),
+            Field::RouteX40 => f64::from(self.view().route_m[3][0]),
+            Field::RouteY40 => f64::from(self.view().route_m[3][1]),
+            Field::SpeedLimit => f64::from(self.view().speed_limit_mps),
+            Field::RouteOffset => f64::from(self.view().route_offset_m),
+            Field::RouteLeft => f64::from(self.view().route_left_m),
+            Field::LeaderGap => f64::from(self.view().leader_gap_m),
+            Field::LeaderSpeed => f64::from(self.view().leader_speed_mps),
+            Field::SignalGap => f64::from(self.view().signal_gap_m),
             Field::Ultrasonic1 => f64::from(self.ultrasonic_m[0]),
             Field::Ultrasonic2 => f64::from(self.ultrasonic_m[1]),
             Field::Ultrasonic3 => f64::from(self.ultrasonic_m[2]),
@@ -101,7 +116,7 @@ impl SensorReadings {
             Field::UltrasonicValid => deliver(SensorKind::Ultrasonic.bit()),
             around => around
                 .place_around()
-                .map_or(0.0, |place| f64::from(self.route.around[place])),
+                .map_or(0.0, |place| f64::from(self.view().around[place])),
         }
     }
 }
@@ -231,7 +246,7 @@ mod tests {
     #[test]
     fn a_heros_route_is_normalised_by_its_distances() {
         let readings = SensorReadings {
-            route: HeroView {
+            route: Some(Box::new(HeroView {
                 route_m: [[5.0, 0.0], [8.0, 5.0], [20.0, -20.0], [0.0, 40.0]],
                 speed_limit_mps: 15.0,
                 route_offset_m: -2.5,
@@ -240,7 +255,7 @@ mod tests {
                 leader_speed_mps: 0.0,
                 signal_gap_m: 25.0,
                 ..HeroView::default()
-            },
+            })),
             ..SensorReadings::default()
         };
         let fields = vec![

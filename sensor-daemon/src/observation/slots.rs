@@ -63,6 +63,7 @@ impl Slots {
     }
 
     /// The slot of `vehicle` at this tick: its own, or the lowest free one.
+    #[inline]
     pub fn occupy(&mut self, vehicle: u32) -> usize {
         let index = vehicle as usize;
         if index >= self.of_vehicle.len() {

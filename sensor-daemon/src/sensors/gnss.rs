@@ -222,7 +222,8 @@ impl GnssReceiver {
     /// Takes the numbers that [`GnssReceiver::plan`] planned, in the same order: white noise, noise of the correlated error.
     #[inline(always)]
     pub fn take(&self, drawn: &mut DrawnNormals) -> [NormalBlock; 2] {
-        [self.has_white_noise(), self.has_correlated_noise()].map(|is_planned| drawn.take(is_planned))
+        let white = drawn.take(self.has_white_noise());
+        [white, drawn.take(self.has_correlated_noise())]
     }
 
     /// State of the receiver of a road user that begins a trajectory.
@@ -313,11 +314,12 @@ impl GnssReceiver {
     pub fn fix(&self, [x_m, y_m, z_m]: [f64; 3], errors: &GnssErrors) -> GnssFix {
         let (view, factor) = (errors.view, errors.factor);
         let noisy = factor * view.noise_factor;
-        let error_m = [0, 1, 2].map(|axis: usize| {
+        let along = |axis: usize| {
             let white = self.white_m[axis] * f64::from(errors.white[axis]);
             let correlated = self.correlated_m[axis] * f64::from(errors.correlated[axis]);
             noisy * (white + correlated) + factor * (self.bias_m[axis] + errors.unit_bias_m[axis]) + view.offset_m[axis]
-        });
+        };
+        let error_m = [along(0), along(1), along(2)];
         let arc = self.ground.arc(y_m, [error_m[0], error_m[1]]);
         let displaced = self.map.displaced(
             NetPosition { x_m, y_m },

@@ -163,9 +163,17 @@ pub(super) fn path_limits(vehicle: &SizedModel) -> PathLimits {
 /// Motion of all members over one sub-step in the order of [`SubStep`]; the first four fields count from the start of the tick.
 pub type BatchRow = [[f32; BATCH]; SUB_STEP];
 
+/// No model of the catalogue.
+const NO_MODEL: u32 = u32::MAX;
+/// What is transposed at once: as many vehicles as fields of a sub-step.
+const BLOCK: usize = 4;
+
 /// Vehicles of one model side by side.
 #[derive(Debug, Clone)]
 pub struct VehicleBatch<P, const N: usize> {
+    /// Index in the catalogue of the model whose parameters and limits each member has.
+    models: [u32; BATCH],
+    limits: [DrivingLimits; BATCH],
     state: [BatchColumn; STATE],
     curve: [BatchColumn; CURVE],
     rise: [BatchColumn; RISE],
@@ -202,6 +210,8 @@ impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
     pub fn new(sub_steps: usize) -> Self {
         let zero = [0.0; BATCH];
         let mut batch = Self {
+            models: [NO_MODEL; BATCH],
+            limits: [DrivingLimits::NONE; BATCH],
             state: [zero; STATE],
             curve: [zero; CURVE],
             rise: [zero; RISE],
@@ -218,20 +228,88 @@ impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
         batch
     }
 
-    /// Loads a vehicle as `member`, with its reference and the road under its front bumper, `front_m` ahead of the rear axle.
-    pub fn load(
-        &mut self,
-        member: usize,
-        params: &P,
-        state: &ModelState,
-        reference: (&ReferenceCurve, &RoadRise),
-        front_m: f64,
-    ) {
+    /// Gives `member` the parameters of the model with this index in the catalogue, and its limits with or without a preview.
+    #[inline]
+    pub fn set_model(&mut self, member: usize, model: u32, params: &P, has_preview: bool) {
+        // Few models move most vehicles: a member mostly has its parameters already.
+        if self.models[member] != model {
+            self.models[member] = model;
+            scatter(&mut self.params, member, params);
+            self.limits[member] = match has_preview {
+                true => params.preview_limits(),
+                false => params.driving_limits(),
+            };
+        }
+    }
+
+    /// The limits that the reference of a member respects.
+    #[must_use]
+    pub fn limits(&self, member: usize) -> &DrivingLimits {
+        &self.limits[member]
+    }
+
+    /// Loads a vehicle as `member`, with its reference and the road under its front bumper, `front_m` ahead of the rear axle. Its model is
+    /// that of the last [`VehicleBatch::set_model`].
+    #[inline]
+    pub fn load(&mut self, member: usize, state: &ModelState, reference: (&ReferenceCurve, &RoadRise), front_m: f64) {
         scatter(&mut self.state, member, state);
         scatter(&mut self.curve, member, reference.0);
         scatter(&mut self.rise, member, reference.1);
-        scatter(&mut self.params, member, params);
         self.front_m[member] = front_m;
+    }
+
+    /// Writes the sub-steps of the first members, relative to the last of them: those of each member from its place in `rows` on.
+    pub fn write_all(&self, places: impl ExactSizeIterator<Item = usize>, rows: &mut [SubStep]) {
+        let (count, mut places_of) = (places.len().min(BATCH), [0; BATCH]);
+        places_of.iter_mut().zip(places).for_each(|(to, place)| *to = place);
+        #[cfg(target_arch = "x86_64")]
+        #[expect(
+            unsafe_code,
+            reason = "a call of a function compiled for more than the baseline processor: copies no registers"
+        )]
+        {
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: this condition has just found the feature on this processor.
+                return unsafe { self.write_all_avx2(&places_of, count, rows) };
+            }
+        }
+        self.write_all_here(&places_of, count, rows);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn write_all_avx2(&self, places_of: &[usize; BATCH], count: usize, rows: &mut [SubStep]) {
+        self.write_all_here(places_of, count, rows);
+    }
+
+    /// The same code for every processor, compiled into each caller.
+    #[inline(always)]
+    fn write_all_here(&self, places_of: &[usize; BATCH], count: usize, rows: &mut [SubStep]) {
+        let Some(last) = self.rows.last() else { return };
+        let whole = count - count % BLOCK;
+        let parts: &mut [[[f32; BLOCK]; SUB_STEP / BLOCK]] = bytemuck::must_cast_slice_mut(rows);
+        for (block, places) in places_of[..whole].as_chunks::<BLOCK>().0.iter().enumerate() {
+            let of_block = |field: &[f32; BATCH]| field.as_chunks::<BLOCK>().0[block];
+            let end = [0, 1, 2, 3].map(|field: usize| of_block(&last[field]));
+            for (index, moved) in self.rows.iter().enumerate() {
+                let (fields, _) = moved.as_chunks::<BLOCK>();
+                let places = places.map(|place| place + index);
+                for (part, fields) in fields.iter().enumerate() {
+                    let mut numbers = [0, 1, 2, 3].map(|field: usize| of_block(&fields[field]));
+                    if part == 0 {
+                        for (numbers, end) in numbers.iter_mut().zip(&end) {
+                            numbers.iter_mut().zip(end).for_each(|(number, end)| *number -= end);
+                        }
+                    }
+                    for (place, numbers) in places.into_iter().zip(transposed(numbers)) {
+                        parts[place][part] = numbers;
+                    }
+                }
+            }
+        }
+        for member in whole..count {
+            self.write(member, &mut rows[places_of[member]..][..self.rows.len()]);
+        }
     }
 
     /// Writes the sub-steps of a member, relative to the last of them.
@@ -392,6 +470,38 @@ impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
             }
         }
     }
+}
+
+/// Rows become columns.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+#[expect(
+    unsafe_code,
+    reason = "the intrinsics: without them each number takes three instructions"
+)]
+fn transposed(rows: [[f32; BLOCK]; BLOCK]) -> [[f32; BLOCK]; BLOCK] {
+    use std::arch::x86_64::{_mm_movehl_ps, _mm_movelh_ps, _mm_unpackhi_ps, _mm_unpacklo_ps};
+    let [a, b, c, d] = rows.map(bytemuck::must_cast);
+    // SAFETY: every processor of this architecture has SSE.
+    let columns = unsafe {
+        let (front, back) = (
+            [_mm_unpacklo_ps(a, b), _mm_unpacklo_ps(c, d)],
+            [_mm_unpackhi_ps(a, b), _mm_unpackhi_ps(c, d)],
+        );
+        [
+            _mm_movelh_ps(front[0], front[1]),
+            _mm_movehl_ps(front[1], front[0]),
+            _mm_movelh_ps(back[0], back[1]),
+            _mm_movehl_ps(back[1], back[0]),
+        ]
+    };
+    columns.map(bytemuck::must_cast)
+}
+
+/// Rows become columns.
+#[cfg(not(target_arch = "x86_64"))]
+fn transposed(rows: [[f32; BLOCK]; BLOCK]) -> [[f32; BLOCK]; BLOCK] {
+    std::array::from_fn(|column| rows.map(|row| row[column]))
 }
 
 /// Sub-steps of `dt_s` from one demand to the next: the tracker updates demands 50 times a second, as often as a steering actuator

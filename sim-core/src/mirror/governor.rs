@@ -38,6 +38,17 @@ pub struct DrivingLimits {
 }
 
 impl DrivingLimits {
+    /// No motion at all.
+    pub const NONE: Self = Self {
+        lateral_mps2: 0.0,
+        curvature_per_m: 0.0,
+        accel_mps2: 0.0,
+        decel_mps2: 0.0,
+        power_by_mass: 0.0,
+        drag_by_mass_per_m: 0.0,
+        rolling_mps2: 0.0,
+    };
+
     /// Largest acceleration, deceleration and lateral acceleration at a speed, m/s².
     pub(super) fn at(&self, speed_mps: f64) -> [f64; 3] {
         let power =

@@ -94,6 +94,9 @@ const NOWHERE: u32 = u32::MAX;
 /// Most road users announced in one episode: four bytes are kept for each.
 const MAX_ANNOUNCED: u32 = 1 << 26;
 
+/// Rows between a path that is prefetched and the one at hand.
+const PATHS_AHEAD: usize = 4;
+
 /// All road users of the current episode.
 #[derive(Debug)]
 pub struct Mirror {
@@ -303,6 +306,22 @@ impl Mirror {
         }
     }
 
+    /// Prefetches road users and their paths some rows behind `index`: a path is spread over memory, and each road user would wait for it.
+    #[inline(never)]
+    fn prefetch_paths(&self, states: &[TrafficState], index: usize) {
+        let place = |rows: usize| {
+            let later = states.get(index + rows)?;
+            self.places.get(later.vehicle as usize).map(|place| *place as usize)
+        };
+        if let Some(place) = place(2 * PATHS_AHEAD) {
+            PrefetchRange::new(&self.slab, place, 1).fetch_all();
+            PrefetchRange::new(&self.paths, place, 1).fetch_all();
+        }
+        if let Some(path) = place(PATHS_AHEAD).and_then(|place| self.paths.get(place)) {
+            path.prefetch();
+        }
+    }
+
     /// Takes the state of all road users at the end of a SUMO step. Their ticks are written by [`Mirror::write_tick`].
     ///
     /// # Errors
@@ -313,7 +332,10 @@ impl Mirror {
         self.present.clear();
         self.in_whole_step = 0;
         let tick = header.tick;
-        for now in states {
+        for (index, now) in states.iter().enumerate() {
+            if !self.paths.is_empty() {
+                self.prefetch_paths(states, index);
+            }
             let vehicle = now.vehicle;
             let place = self.place(vehicle).ok_or(MirrorError::Unannounced { vehicle, tick })?;
             if !is_finite(now) {
@@ -496,12 +518,18 @@ impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
             next.1.fetch(sub_step, per_tick);
             next.2.fetch(sub_step, per_tick);
         });
+        self.batch
+            .write_all(self.loaded.iter().map(|(_, row)| row * per_tick), rows);
         for (member, (place, row)) in self.loaded.drain(..).enumerate() {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
             let (road_user, out) = (&mut context.slab[place as usize], &mut states[row]);
             let set = road_user.store(tick, context.settings, &self.batch, member, out, sub_steps);
-            context.resynchronised.extend(set);
-            context.guidances.extend(road_user.guidance(out));
+            if let Some(set) = set {
+                context.resynchronised.push(set);
+            }
+            if let Some(guidance) = road_user.guidance(out) {
+                context.guidances.push(guidance);
+            }
             context.tracking.add(out);
         }
     }

@@ -6,7 +6,7 @@
 
 use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
 
-use super::{governor::DrivingLimits, window::WindowStep};
+use super::{governor::DrivingLimits, prefetch::PrefetchRange, window::WindowStep};
 use crate::trig::wrap_angle;
 
 /// Most frames by which a mirror may be later than it should be.
@@ -143,6 +143,17 @@ impl PacedPath {
         self.find_ahead();
         self.now = self.state(mean);
         self.now
+    }
+
+    /// Prefetches the points between the mirror and the next mean.
+    #[inline]
+    pub fn prefetch(&self) {
+        let behind = self.ahead + 1;
+        let first = self.newest.saturating_sub(behind);
+        PrefetchRange::new(&self.points, first, self.newest + 2 - first).fetch_all();
+        // Those before the beginning of the ring are at its end.
+        let rest = behind.saturating_sub(self.newest);
+        PrefetchRange::new(&self.points, self.points.len().saturating_sub(rest), rest).fetch_all();
     }
 
     /// Takes the next mean, `deviation_m` from SUMO's path, and moves the mirror for a frame. Without `limits` it is on time.

@@ -23,6 +23,12 @@ impl PrefetchRange {
         }
     }
 
+    /// Prefetches the whole range.
+    #[inline(always)]
+    pub fn fetch_all(self) {
+        self.fetch(0, 1);
+    }
+
     /// Prefetches one of `parts` equal parts.
     #[inline(always)]
     pub fn fetch(self, part: usize, parts: usize) {

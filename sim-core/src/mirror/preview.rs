@@ -6,6 +6,7 @@ use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
 
 use super::{
     pace::{PacedPath, PathLimits},
+    prefetch::PrefetchRange,
     window::{StateWindow, WindowStep},
 };
 
@@ -38,6 +39,14 @@ impl PathAhead {
         self.recent.push_front(*now);
         let mean = self.window.restart(now, frame_s);
         self.path.restart(&mean, frame_s)
+    }
+
+    /// Prefetches what the next state needs, of a path whose own numbers are in the cache.
+    #[inline]
+    pub fn prefetch(&self) {
+        self.window.prefetch();
+        self.path.prefetch();
+        PrefetchRange::new(self.recent.as_slices().0, 0, 1).fetch_all();
     }
 
     /// Takes the next state of a body of `length_m`, and moves its mirror for a frame. `None` if no vehicle moves like that. A road user

@@ -314,6 +314,7 @@ pub(super) struct LaneJump {
 }
 
 /// Whether a vehicle of `length_m` can have moved from `before` to `now` in `step_s`, and its lane change meanwhile.
+#[inline]
 pub(super) fn join(
     before: &TrafficState,
     now: &TrafficState,
@@ -341,6 +342,7 @@ pub(super) fn join(
 /// The sideways part of a chord that the heading half-way and the turn do not explain, if it is a lane change.
 ///
 /// SUMO's heading is the chord of the body, so in a turn the front bumper moves `turn · length / 2` further to the inside.
+#[inline]
 fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f64) -> Option<LaneJump> {
     let far = dot(chord_m, chord_m) > LANE_JUMP_M * LANE_JUMP_M;
     if !far || turn_rad.abs() > LANE_JUMP_TURN_RAD {

@@ -8,7 +8,7 @@ use ipc_schema::{
 
 use super::{
     batch::{BatchModel, VehicleBatch, path_limits},
-    curve::ReferenceCurve,
+    curve::{ReferenceCurve, ReferencePoint},
     departure::Departure,
     guidance::{self, NarrowTurn},
     hero::Hero,
@@ -319,22 +319,15 @@ impl RoadUser {
         if let Mover::Vehicle { state, path } = &mut self.mover {
             let start_s = f64::from(tick) * settings.tick_s;
             let spread_s = settings.vehicle.lane_change_s;
-            let curve = path.tick(
-                start_s,
-                settings.tick_s,
-                state.speed_mps,
-                spread_s,
-                &match settings.vehicle.preview_s > 0.0 {
-                    true => params.preview_limits(),
-                    false => params.driving_limits(),
-                },
-            );
+            batch.set_model(member, self.model, params, settings.vehicle.preview_s > 0.0);
+            let limits = batch.limits(member);
+            let curve = path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, limits);
             let rise = path.road(start_s).1;
-            batch.load(member, params, state, (&curve, &rise), self.dimensions.front_m());
+            batch.load(member, state, (&curve, &rise), self.dimensions.front_m());
         }
     }
 
-    /// Takes the vehicle from its batch and writes the tick. Returns the jump if the vehicle was set to its path because it was too far
+    /// Takes the vehicle from its batch and writes the tick, whose sub-steps the batch has written. Returns the jump if the vehicle was set to its path because it was too far
     /// away. A vehicle with a path ahead is led from then on instead ([`GUIDED`]).
     pub fn store<P: BatchModel<N>, const N: usize>(
         &mut self,
@@ -354,7 +347,6 @@ impl RoadUser {
         let start_s = f64::from(tick) * settings.tick_s;
         let end_s = start_s + settings.tick_s;
         *state = state.settled();
-        batch.write(member, rows);
         let road = batch.road(member);
         write_moved(state, road, path.road(start_s).0, rows, out);
         // Only their own sensors read it.
@@ -365,34 +357,23 @@ impl RoadUser {
         let target = batch.curve(member).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
-        let away_m = [square.sqrt(), path.undriven_m()];
-        let guided = match settings.vehicle.preview_s > 0.0 {
-            true => guidance::cause(state, away_m, path.lane_change_m(), self.narrow),
-            false => None,
-        };
-        if guided.is_some() {
-            let front = state.point_ahead(front_m);
-            let across = state.lateral_mps + front_m * state.yaw_rate_radps;
-            let [cos, sin] = state.heading;
-            let velocity = [
-                state.speed_mps * cos - across * sin,
-                state.speed_mps * sin + across * cos,
-            ];
-            let [away, leaving] = [(front, target.position_m), (velocity, target.velocity_mps)]
-                .map(|(ours, its)| [ours[0] - its[0], ours[1] - its[1]]);
-            path.move_reference(&target, away, leaving);
-            self.guided = guided.map(|cause| GuidedVehicle {
-                cause,
-                away_m: (away_m[0] + away_m[1]) as f32,
-                turned: path.turned_from(end_s, [state.yaw_rad, state.yaw_rate_radps]),
-            });
+        let undriven_m = path.undriven_m();
+        if settings.vehicle.preview_s > 0.0 {
+            let away_m = [square.sqrt(), undriven_m];
+            if let Some(cause) = guidance::cause(state, away_m, path.lane_change_m(), self.narrow) {
+                self.guided = Some(GuidedVehicle {
+                    cause,
+                    away_m: (away_m[0] + away_m[1]) as f32,
+                    turned: begin_guidance(state, path, front_m, &target, end_s),
+                });
+            }
         }
         let limit = settings.vehicle.resynchronise_m;
-        let lost = if guided.is_some() {
+        let lost = if self.guided.is_some() {
             None
         } else if square > limit * limit {
             Some(ResynchronisationCause::TrackingError)
-        } else if path.undriven_m() > settings.vehicle.leave_path_m {
+        } else if undriven_m > settings.vehicle.leave_path_m {
             Some(ResynchronisationCause::LeftPath)
         } else {
             None
@@ -413,7 +394,7 @@ impl RoadUser {
             out.tracking_longitudinal_m = error.longitudinal_m as f32;
         }
         let set = self.flag(lost, jump_m, out);
-        if guided.is_some() {
+        if self.guided.is_some() {
             out.flags |= GUIDED;
         }
         set
@@ -548,6 +529,29 @@ impl RoadUser {
             out.rear_overhang_m = rear_overhang_m as f32;
         }
     }
+}
+
+/// Moves the reference of a vehicle onto its front bumper, whose own reference is `target`. Returns by how much its heading and the rate
+/// differ from SUMO's at `end_s`, rad and rad/s.
+#[cold]
+fn begin_guidance(
+    state: &ModelState,
+    path: &mut ReferencePath,
+    front_m: f64,
+    target: &ReferencePoint,
+    end_s: f64,
+) -> [f64; 2] {
+    let front = state.point_ahead(front_m);
+    let across = state.lateral_mps + front_m * state.yaw_rate_radps;
+    let [cos, sin] = state.heading;
+    let velocity = [
+        state.speed_mps * cos - across * sin,
+        state.speed_mps * sin + across * cos,
+    ];
+    let [away, leaving] = [(front, target.position_m), (velocity, target.velocity_mps)]
+        .map(|(ours, its)| [ours[0] - its[0], ours[1] - its[1]]);
+    path.move_reference(target, away, leaving);
+    path.turned_from(end_s, [state.yaw_rad, state.yaw_rate_radps])
 }
 
 fn distance_m(from: (f64, f64), to: (f64, f64)) -> f64 {

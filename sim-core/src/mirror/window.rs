@@ -6,7 +6,10 @@
 
 use ipc_schema::traffic::TrafficState;
 
-use super::reference::{LaneJump, PathJoin, join};
+use super::{
+    prefetch::PrefetchRange,
+    reference::{LaneJump, PathJoin, join},
+};
 use crate::trig::wrap_angle;
 
 /// Longest leap over a junction, metres.
@@ -86,6 +89,13 @@ impl StateWindow {
         }
         self.mean = self.mean_of_samples();
         self.mean
+    }
+
+    /// Prefetches what the next state needs.
+    #[inline]
+    pub fn prefetch(&self) {
+        PrefetchRange::new(&self.samples, self.oldest.saturating_sub(1), 2).fetch_all();
+        PrefetchRange::new(&self.lamps, 0, self.lamps.len()).fetch_all();
     }
 
     /// Takes the next state of a body of `length_m`; `None` if no vehicle moves like that.

@@ -87,22 +87,21 @@ fn alone<P: BatchModel<N>, const N: usize>(
 fn compare<P: BatchModel<N>, const N: usize>(cases: &[Case], params: &[P]) -> Result<(), TestCaseError> {
     let mut batch: VehicleBatch<P, N> = VehicleBatch::new(10);
     for (member, (case, params)) in cases.iter().zip(params).enumerate() {
-        batch.load(
-            member,
-            params,
-            &case.state,
-            (&case.curve, &case.rise),
-            case.body.front_m(),
-        );
+        batch.set_model(member, member as u32, params, false);
+        batch.load(member, &case.state, (&case.curve, &case.rise), case.body.front_m());
     }
     let mut baseline = batch.clone();
     batch.advance(0.01, &|_| ());
     baseline.advance_here(0.01, &|_| ());
     prop_assert_eq!(&batch.rows, &baseline.rows, "whatever the processor's vectors");
+    // With room between the members.
+    let mut all = vec![SubStep::default(); 20 * cases.len()];
+    batch.write_all((0..cases.len()).map(|member| 20 * member), &mut all);
     for (member, (case, params)) in cases.iter().zip(params).enumerate() {
         let steps = alone(case, params, 10);
         let mut rows = [SubStep::default(); 10];
         batch.write(member, &mut rows);
+        prop_assert_eq!(&rows[..], &all[20 * member..][..10]);
         for ((state, _), row) in steps.iter().zip(&rows) {
             prop_assert!((f64::from(row.dx_m) - (state.x_m - steps[9].0.x_m)).abs() < 1e-5);
             prop_assert!((f64::from(row.dyaw_rad) - (state.yaw_rad - steps[9].0.yaw_rad)).abs() < 1e-6);
