@@ -126,7 +126,7 @@ class Scene:
         self.skipped = 0
         """Frames that were not drawn because newer ones had arrived, as the link counts them."""
         self._stop_lines = _stop_lines(run_map)
-        draw_map(self._canvas, run_map)
+        self._paint = draw_map(self._canvas, run_map)
         draw_legend(self._canvas)
         plots.name_series(self._canvas)
 
@@ -201,6 +201,7 @@ class Scene:
         self._draw_contacts(world.header)
         self._draw_routes(rows[0] if rows else None)
         if rows:
+            self._paint.follow(np.array([rows[0]["x_m"], rows[0]["y_m"]]))
             self._canvas.scalar(plots.SPEED, float(np.hypot(*rows[0]["velocity_body_mps"][:2])))
         figures = self._figures()
         self._tally.add(self._drawn_at[-1], sample.age_ms(), figures)

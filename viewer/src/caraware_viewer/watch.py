@@ -16,12 +16,17 @@ from caraware_viewer.detail import Region
 from caraware_viewer.display import Display, has_screen
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import RunLink, connect, find_run
+from caraware_viewer.page import Pace
 from caraware_viewer.scene import Scene
 from caraware_viewer.views import blueprint, layout_of, mode_of
 from caraware_viewer.wire import FrameError
 
 _POLL_INTERVAL_S = 0.1
 _FLUSH_LIMIT_S = 5.0
+_LONGEST_INTERVAL_S = 5.0
+"""Longest time between two ticks, however slow a browser is."""
+_FRAMES_OF_A_TICK = 2.0
+"""Frames that a page draws while the data of a tick comes in."""
 
 
 def watch_run(options: argparse.Namespace) -> int:
@@ -50,8 +55,9 @@ def watch_run(options: argparse.Namespace) -> int:
         )
         layout = Layout(recordings, run_map, options.region)
         layout.arrange(scene)
+        pace = Pace() if display is None or display.page is None else display.page.pace
         drawing = threading.Thread(
-            target=_draw_frames, args=(link, scene, layout, options.rate), name="draw", daemon=True
+            target=_draw_frames, args=(link, scene, layout, options.rate, pace), name="draw", daemon=True
         )
         drawing.start()
         try:
@@ -112,7 +118,12 @@ class Layout:
             recording.send_blueprint(views, make_active=True, make_default=True)
 
 
-def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float) -> None:
+def frame_interval_s(rate_hz: float, frame_s: float) -> float:
+    """Time between two ticks that are sent to a page that takes `frame_s` to draw, at most `rate_hz`."""
+    return max(1 / rate_hz, min(_FRAMES_OF_A_TICK * frame_s, _LONGEST_INTERVAL_S))
+
+
+def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float, pace: Pace) -> None:
     reported: set[str] = set()
     while True:
         begun_s = time.monotonic()
@@ -134,7 +145,7 @@ def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float) ->
             return
         link.subscribe_clouds(scene.cloud_vehicles())
         # Meanwhile newer frames replace those that wait.
-        link.frames.wait_for_close(1 / rate_hz - (time.monotonic() - begun_s))
+        link.frames.wait_for_close(frame_interval_s(rate_hz, pace.frame_s()) - (time.monotonic() - begun_s))
 
 
 def _recordings(
