@@ -23,8 +23,9 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 import frames
@@ -170,6 +171,14 @@ def drawn_figures(drawn: list[DrawnFrame], seconds: float, first_tick_s: float) 
     return row
 
 
+def stand_in_for_a_browser(url: str, seconds: float) -> None:
+    """Reports the pace of a fast page: without an open page the viewer draws a tick every five seconds."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        urllib.request.urlopen(urllib.request.Request(f"{url}pace", b"0.016", method="POST"), timeout=60).close()
+        time.sleep(1.0)
+
+
 def publisher(port: int, vehicles: int, seconds: float) -> subprocess.Popen[str]:
     """A process that publishes the crowd."""
     command = [sys.executable, __file__, "--publish", str(port), "--vehicles", str(vehicles)]
@@ -214,14 +223,15 @@ def measure(options: argparse.Namespace) -> None:
             while time.monotonic() - begun < options.seconds:
                 row: dict[str, float] = {}
                 if browser is None:
-                    time.sleep(options.interval)
+                    stand_in_for_a_browser(opened[1], options.interval)
                 else:
                     row = drawn_figures(browser.drawn(options.interval), options.interval, first_tick_s)
                 print(json.dumps(sample(viewer.pid, browser, time.monotonic() - begun) | row), flush=True)
         finally:
             viewer.send_signal(signal.SIGINT)
             viewer.wait(60)
-            source.send_signal(signal.SIGINT)
+            # Where SIGINT is ignored, as in a script's background, it is so in the children of Python too.
+            source.terminate()
             source.wait(120)
         log.seek(0)
         print(log.read().splitlines()[-1])
@@ -240,7 +250,6 @@ if __name__ == "__main__":
     parser.add_argument("--publish", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.publish:
-        with suppress(KeyboardInterrupt):
-            publish(options.publish, options.vehicles, time.time() + options.seconds)
+        publish(options.publish, options.vehicles, time.time() + options.seconds)
     else:
         measure(options)

@@ -42,12 +42,15 @@ def read(path: Path) -> dict[str, Entity]:
     return entities
 
 
-def layout(path: Path) -> dict[str, list[Any]]:
-    """Every value in the newest layout that a recording brings along, by component ("Background:color")."""
+def layouts(path: Path) -> dict[str, list[Any]]:
+    """Every value in the layouts that a recording brings along, in no order, by component ("Background:color")."""
     reader = RrdReader(path)
     values: dict[str, list[Any]] = {}
-    for chunk in reader.stream(store=reader.blueprints()[-1]):
-        batch = chunk.to_record_batch()
-        for name in (name for name in batch.schema.names if ":" in name):
-            values.setdefault(name, []).extend(value for value in batch.column(name).to_pylist() if value is not None)
+    for store in reader.blueprints():
+        for chunk in reader.stream(store=store):
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names:
+                if ":" in name:
+                    known = values.setdefault(name, [])
+                    known += [value for value in batch.column(name).to_pylist() if value is not None]
     return values

@@ -320,7 +320,7 @@ def check_recording(path: Path) -> None:
         static_map.SPACE_BUILDINGS,
     ):
         assert found[entity].rows[0][0] == recordings.ALWAYS, entity
-    arranged = recordings.layout(path)
+    arranged = recordings.layouts(path)
     names = {name for value in arranged["ViewBlueprint:display_name"] for name in value}
     assert names >= {"Top view", "Run and vehicle", "Around the followed vehicle", *TITLES["train"]}
     # One theme: every view of the opened file has the background that the page has.

@@ -12,7 +12,7 @@ from ports import free_port
 
 from caraware_viewer.display import Display
 from caraware_viewer.page import JOINING_S, Pace
-from caraware_viewer.watch import frame_interval_s
+from caraware_viewer.watch import FrameRate
 
 
 def test_the_slowest_page_counts_until_it_is_closed() -> None:
@@ -28,10 +28,18 @@ def test_the_slowest_page_counts_until_it_is_closed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "frame_s", "interval_s"), [(10, 0.0, 0.1), (10, 0.03, 0.1), (10, 0.3, 0.6), (2, 0.1, 0.5), (10, 60, 5)]
+    ("most_hz", "frame_s", "interval_s"), [(10, 0.03, 0.1), (10, 0.3, 0.6), (2, 0.1, 0.5), (10, 60, 5)]
 )
-def test_a_slow_page_gets_fewer_ticks(rate_hz: float, frame_s: float, interval_s: float) -> None:
-    assert frame_interval_s(rate_hz, frame_s) == pytest.approx(interval_s)
+def test_a_slow_page_gets_fewer_ticks(most_hz: float, frame_s: float, interval_s: float) -> None:
+    pace = Pace()
+    pace.report(frame_s)
+    assert FrameRate(most_hz, pace, keeps=False).interval_s() == pytest.approx(interval_s)
+
+
+def test_without_an_open_page_few_ticks_are_drawn_unless_a_file_keeps_them() -> None:
+    assert FrameRate(10, Pace(), keeps=False).interval_s() == 5.0
+    assert FrameRate(10, Pace(), keeps=True).interval_s() == pytest.approx(0.1)
+    assert FrameRate(10, None, keeps=False).interval_s() == pytest.approx(0.1)
 
 
 def test_a_browser_reports_its_pace_and_other_sites_do_not() -> None:
