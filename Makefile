@@ -16,7 +16,7 @@ PREFIX ?=
 EXTRAS ?= envs,data,metrics
 
 .PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
-	timed-packages timed-programs with-cuda model deny bench peers peers-metadrive peers-smarts faces site clean
+	timed-packages timed-programs with-cuda newcomer model deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -119,6 +119,9 @@ test-python:
 	$(VENV)/bin/python -m pytest -q maps/town/tests
 	$(VENV)/bin/python -m pytest -q maps/valley/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
+
+newcomer: build ## every command block of README and docs, also those that the tests only parse: about a quarter of an hour
+	$(VENV)/bin/python scripts/newcomer.py --all
 
 # The tests look at fewer deaths, preemptions and frames. Miri needs a nightly toolchain: rustup toolchain install nightly --component miri,rust-src
 model: prerequisites $(VENV)/.installed ## the models and the parsers for longer than in the tests, the unsafe parts under Miri: about an hour

@@ -1,6 +1,6 @@
 """Draws the figures of `docs/vehicle-model.md` from the responses of the vehicle models.
 
-cargo run --release -p sim-core --example response > response.csv
+cargo run --release --example response > response.csv
 .venv/bin/python docs/images/draw_vehicle_model.py response.csv
 """
 

@@ -1,6 +1,6 @@
 """Draws the figures of `docs/sensor-models.md` from sensor samples.
 
-cargo run --release -p sensor-daemon --example sensor_plots -- DIR
+cargo run --release --example sensor_plots -- DIR
 .venv/bin/python docs/images/sensor_plots.py DIR
 
 A figure whose tables are not in DIR is left as it is.

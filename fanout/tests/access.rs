@@ -301,7 +301,7 @@ fn certificates_grant_access() {
 fn make_certificates(directory: &Path) {
     let page = include_str!("../../docs/remote.md");
     let lines = page
-        .split("```bash certificates\n")
+        .split("```sh certificates\n")
         .nth(1)
         .and_then(|rest| rest.split("```").next())
         .unwrap();

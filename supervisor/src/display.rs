@@ -407,4 +407,18 @@ mod tests {
         );
         assert_eq!(start.report(400, 2, ready_at), None);
     }
+
+    /// The boards of a resumed run begin with what was made before.
+    #[test]
+    fn the_rates_of_a_resumed_run_leave_out_what_was_made_before() {
+        let (mut view, at) = (ProgressView::read(&[]), Instant::now());
+        (view.tick_s, view.steps, view.all_ticks) = (0.5, 1_000_500, 40_200);
+        let begin = ProgressBegin {
+            at,
+            steps: 1_000_000,
+            ticks: 40_000,
+        };
+        view.set_rates(&begin, at + Duration::from_secs(2));
+        assert_eq!(view.rate(), "250 steps/s  50.0 × real time");
+    }
 }

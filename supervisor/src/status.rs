@@ -350,6 +350,15 @@ fn wait(time: Duration) {
     std::thread::park_timeout(time);
 }
 
+/// What a run of this mode still does when it is asked to end, for messages.
+#[must_use]
+pub fn last_work(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Train => ": the trainer writes a checkpoint",
+        Mode::Simulate | Mode::Play => "",
+    }
+}
+
 /// Asks the supervisor of a run to end the run, and waits until the run has left the registry.
 ///
 /// # Errors
@@ -360,10 +369,7 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
         .ok_or_else(|| Exit::run("the run has no supervisor", "`caraware doctor --clean`"))?;
     kill_process(pid, Signal::TERM)
         .map_err(|error| Exit::run(format!("cannot signal process {}: {error}", run.supervisor_pid), ""))?;
-    match run.mode.has_trainer() {
-        true => crate::say!("stopping {}: the trainer writes a checkpoint", run.name),
-        false => crate::say!("stopping {}", run.name),
-    }
+    crate::say!("stopping {}{}", run.name, last_work(run.mode));
     let deadline = Instant::now() + STOP_WITHIN;
     while Instant::now() < deadline {
         wait(Duration::from_millis(100));
@@ -376,4 +382,15 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
         format!("{} has not stopped within {} s", run.name, STOP_WITHIN.as_secs()),
         format!("kill process {}", run.supervisor_pid),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_run_that_learns_writes_a_checkpoint_at_its_end() {
+        assert_eq!(last_work(Mode::Train), ": the trainer writes a checkpoint");
+        assert_eq!([Mode::Simulate, Mode::Play].map(last_work), ["", ""]);
+    }
 }

@@ -35,6 +35,7 @@ use crate::{
     restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts},
     socket::{self, HandoverReport, ReceivedRequest},
     stall::{ProcessPlace, READY_WITHIN, StallChange, StallWatch},
+    status::last_work,
 };
 
 /// An event that wakes the supervisor.
@@ -545,10 +546,7 @@ impl Supervisor {
 
     /// Asks every process to end and waits; kills the rest after a time limit or a second Ctrl-C.
     fn stop_all(&mut self, ending: &RunEnding) {
-        let what = match self.processes.run().mode.has_trainer() {
-            true => ": the trainer writes a checkpoint",
-            false => "",
-        };
+        let what = last_work(self.processes.run().mode);
         match ending {
             RunEnding::Completed => {}
             RunEnding::Interrupted => display::notice(&format!("stopping{what} (press Ctrl-C again to kill)")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import fcntl
 import io
 import json
@@ -12,6 +13,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -49,6 +51,19 @@ def find() -> str:
     raise RuntimeError("no Chromium: run scripts/browser.sh (Debian and Ubuntu: apt-get install chromium)")
 
 
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A picture that the page has drawn and that differs from the one before."""
+
+    at_s: float
+    """When it was shown, seconds since 1970."""
+    jpeg: bytes
+
+    def picture(self) -> NDArray[np.uint8]:
+        """`[height, width, 3]`."""
+        return np.asarray(Image.open(io.BytesIO(self.jpeg)).convert("RGB"))
+
+
 class Browser:
     """One page in a browser with a fresh profile. Use as a context manager."""
 
@@ -81,6 +96,7 @@ class Browser:
         """Addresses that the page requested."""
         self.refused: list[str] = []
         """Messages of the page's console about its content security policy."""
+        self._drawn: list[DrawnFrame] = []
         self._session: str | None = None
         targets = self.call("Target.getTargets")["targetInfos"]
         page = next(target for target in targets if target["type"] == "page")
@@ -117,17 +133,33 @@ class Browser:
         data = self.call("Page.captureScreenshot", format="png", timeout_s=300.0)["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
-    def call(self, method: str, timeout_s: float = 120.0, **parameters: Any) -> dict[str, Any]:
-        """Sends a command and waits for its answer."""
+    def drawn(self, seconds: float) -> list[DrawnFrame]:
+        """The frames that the page draws in the next `seconds`."""
+        self._drawn = []
+        self.call("Page.startScreencast", format="jpeg", quality=90, everyNthFrame=1)
+        deadline = time.monotonic() + seconds
+        with contextlib.suppress(TimeoutError):
+            while True:
+                self._record(self._receive(deadline, "Page.startScreencast"))
+        self.call("Page.stopScreencast")
+        return self._drawn
+
+    def _send(self, method: str, **parameters: Any) -> int:
+        """Sends a command; returns the number of its answer."""
         self._id += 1
         message: dict[str, Any] = {"id": self._id, "method": method, "params": parameters}
         if self._session is not None:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
+        return self._id
+
+    def call(self, method: str, timeout_s: float = 120.0, **parameters: Any) -> dict[str, Any]:
+        """Sends a command and waits for its answer."""
+        number = self._send(method, **parameters)
         deadline = time.monotonic() + timeout_s
         while True:
             answer = self._receive(deadline, method)
-            if answer.get("id") == self._id:
+            if answer.get("id") == number:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']['message']}")
                 result: dict[str, Any] = answer["result"]
@@ -139,6 +171,10 @@ class Browser:
             self.requests.append(event["params"]["request"]["url"])
         elif event.get("method") == "Log.entryAdded" and "Content Security Policy" in event["params"]["entry"]["text"]:
             self.refused.append(event["params"]["entry"]["text"])
+        elif event.get("method") == "Page.screencastFrame":
+            frame = event["params"]
+            self._send("Page.screencastFrameAck", sessionId=frame["sessionId"])
+            self._drawn.append(DrawnFrame(frame["metadata"]["timestamp"], base64.b64decode(frame["data"])))
 
     def _receive(self, deadline: float, method: str) -> dict[str, Any]:
         while b"\0" not in self._buffer:

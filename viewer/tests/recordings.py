@@ -40,3 +40,17 @@ def read(path: Path) -> dict[str, Entity]:
     for entity in entities.values():
         entity.rows.sort(key=lambda row: row[0])
     return entities
+
+
+def layouts(path: Path) -> dict[str, list[Any]]:
+    """Every value in the layouts that a recording brings along, in no order, by component ("Background:color")."""
+    reader = RrdReader(path)
+    values: dict[str, list[Any]] = {}
+    for store in reader.blueprints():
+        for chunk in reader.stream(store=store):
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names:
+                if ":" in name:
+                    known = values.setdefault(name, [])
+                    known += [value for value in batch.column(name).to_pylist() if value is not None]
+    return values

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from ports import free_port
 
-from caraware_viewer import course, plots, scene, space, static_map, top
+from caraware_viewer import course, plots, scene, space, static_map, top, views
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
@@ -175,7 +175,9 @@ def missing(picture: Picture, mode: Mode) -> list[str]:
         "legend": all(of_color(legend_of(picture), color).sum() > 10 for color in (CAV, HERO, top.GNSS_COLOR)),
         "text": (hud_of(picture).min(axis=-1) > 170).sum() > 800,
         "vehicles in 3-D": of_color(space_of(picture), users, 60).sum() > 30,
-        "solid ground, road or walls in 3-D": (space_of(picture).std(axis=(0, 1)).max() > 8),
+        "solid ground in 3-D": of_color(space_of(picture), static_map.GROUND_COLOR, 5).sum() > 2000,
+        "roads in 3-D": of_color(space_of(picture), static_map.ROAD_COLOR, 5).sum() > 500,
+        "walks in 3-D": of_color(space_of(picture), static_map.WALK_COLOR, 5).sum() > 50,
     }
     for color in mode.positions:
         seen[f"positions of colour {color}"] = of_color(map_of(picture), color).sum() > 10
@@ -274,6 +276,11 @@ def test_a_browser_shows_every_panel_of_a_mode_and_it_moves(mode: Mode, runs: Pa
         check_recording(recorded)
 
 
+TITLES = {
+    mode.name: [plot.title for plot in views.PLOTS if plot.path in mode.plots and mode.name in plot.modes]
+    for mode in MODES
+}
+"""Titles of the plots of a mode."""
 READY = {"train": r"(error \d)", "drive": r"(progress \d)", "simulate": r"(sensing)", "play": r"(policy \d)"}
 """What the progress line shows once a picture can be whole."""
 
@@ -313,5 +320,13 @@ def check_recording(path: Path) -> None:
         static_map.SPACE_BUILDINGS,
     ):
         assert found[entity].rows[0][0] == recordings.ALWAYS, entity
+    arranged = recordings.layouts(path)
+    names = {name for value in arranged["ViewBlueprint:display_name"] for name in value}
+    assert names >= {"Top view", "Run and vehicle", "Around the followed vehicle", *TITLES["train"]}
+    # One theme: every view of the opened file has the background that the page has.
+    backgrounds = {
+        color for kind in ("Background", "PlotBackground") for value in arranged[f"{kind}:color"] for color in value
+    }
+    assert backgrounds == {top.rgba(views.BACKGROUND)}
     factor = [row["Scalars:scalars"][0] for _, row in found[plots.REAL_TIME].rows if "Scalars:scalars" in row]
     assert 0.5 < np.median(factor) < 1.5

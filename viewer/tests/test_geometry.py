@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caraware_viewer import cloud, geometry, solid, static_map, wire
+from caraware_viewer import cloud, geometry, paint, solid, static_map, wire
 from caraware_viewer.canvas import on_screen
 from caraware_viewer.documents import Lane
 
@@ -74,7 +74,7 @@ def test_hatching_fills_a_polygon_with_a_notch() -> None:
 
 
 def test_a_dashed_line_is_in_pieces_along_its_bends() -> None:
-    pieces = static_map.pieces_m(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 3.0, 6.0)
+    pieces = paint.pieces_m(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 3.0, 6.0)
     np.testing.assert_allclose(pieces, [[[0, 0], [3, 0]], [[9, 0], [10, 2]], [[10, 8], [10, 10]]])
 
 
@@ -85,12 +85,12 @@ def lane(points_m: list[list[float]]) -> Lane:
 
 def test_the_left_edge_lies_to_the_left() -> None:
     along_x = lane([[0, 0, 1], [10, 0, 1]])
-    np.testing.assert_allclose(static_map.edge_m(along_x, 1), np.array([[0.0, 2.0], [10.0, 2.0]]))
-    np.testing.assert_allclose(static_map.edge_m(along_x, -1), np.array([[0.0, -2.0], [10.0, -2.0]]))
+    np.testing.assert_allclose(paint.edge_m(along_x, 1), np.array([[0.0, 2.0], [10.0, 2.0]]))
+    np.testing.assert_allclose(paint.edge_m(along_x, -1), np.array([[0.0, -2.0], [10.0, -2.0]]))
 
 
 def test_stripes_of_a_crossing_lie_across_the_way_of_pedestrians() -> None:
-    stripes = np.array(static_map.stripes_m(lane([[0, 0, 0], [3, 0, 0]])))
+    stripes = np.array(paint.stripes_m(lane([[0, 0, 0], [3, 0, 0]])))
     assert len(stripes) == 3
     np.testing.assert_allclose(stripes[0], [[0.25, 1.75], [0.25, -1.75]])
 

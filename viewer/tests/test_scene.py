@@ -321,7 +321,7 @@ def test_seeking_is_in_simulated_time_over_episodes(drawn: Drawn) -> None:
 def test_the_live_picture_replaces_its_frames_and_the_kept_one_has_their_history(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene, "_REPEAT_BYTES", 100_000)
+    monkeypatch.setattr(scene, "_REPEATS_KEPT", 100)
     recordings_of = {name: rr.RecordingStream("test", recording_id="test") for name in ("kept", "live")}
     for name, recording in recordings_of.items():
         recording.save(tmp_path / name)

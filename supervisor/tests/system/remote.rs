@@ -157,7 +157,7 @@ impl Run {
 fn make_certificates(directory: &Path) {
     let page = include_str!("../../../docs/remote.md");
     let lines = page
-        .split("```bash certificates\n")
+        .split("```sh certificates\n")
         .nth(1)
         .unwrap()
         .split("```")

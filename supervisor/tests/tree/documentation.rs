@@ -1,8 +1,11 @@
-//! The pages: every link and path leads somewhere, every command line parses, prose wraps at 100 columns.
+//! The pages: every link and path leads somewhere, every command line and its settings parse, prose wraps at 100 columns.
 
 use std::path::{Path, PathBuf};
 
-use caraware::cli::Cli;
+use caraware::{
+    cli::{Cli, RunArgs, Subcommands},
+    config::{ConfigError, LayeredSettings},
+};
 use clap::{Parser as _, error::ErrorKind};
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
@@ -158,10 +161,28 @@ fn words(line: &str) -> Option<Vec<&str>> {
     Some(words.collect())
 }
 
+/// The command line of `caraware` that a line of a shell script is, if it is one: without the variables before it and the path of
+/// the program. `torchrun … -m caraware.parallel` takes the arguments of `caraware train`.
+fn command_line(line: &str) -> Option<String> {
+    if let Some((_, arguments)) = line.split_once("-m caraware.parallel ") {
+        return Some(format!("caraware train {arguments}"));
+    }
+    let is_assignment = |word: &str| word.contains('=') && word.starts_with(|c: char| c.is_ascii_uppercase());
+    let mut words = line.split(' ').skip_while(|word| is_assignment(word));
+    let program = words.next()?;
+    let is_caraware = program == "caraware" || program.ends_with("/caraware");
+    is_caraware.then(|| format!("caraware {}", words.collect::<Vec<_>>().join(" ")))
+}
+
 /// Why `caraware` would refuse this command line. A mention such as `caraware generate` may leave out what is required.
 fn refusal(line: &str, is_mention: bool) -> Option<String> {
-    let words = words(line)?;
-    let error = Cli::try_parse_from(words).err()?;
+    // `KEY=N` stands for a number.
+    let line = line.replace("=N", "=1");
+    let words = words(&line)?;
+    let error = match Cli::try_parse_from(words) {
+        Ok(cli) => return settings_refusal(&cli),
+        Err(error) => error,
+    };
     let is_help = matches!(
         error.kind(),
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand
@@ -172,6 +193,71 @@ fn refusal(line: &str, is_mention: bool) -> Option<String> {
             ErrorKind::MissingRequiredArgument | ErrorKind::MissingSubcommand
         );
     (!is_help && !is_short).then(|| error.to_string())
+}
+
+/// Why the settings of a command line would be refused.
+fn settings_refusal(cli: &Cli) -> Option<String> {
+    let only_settings = |set: &[String]| RunArgs {
+        set: set.to_vec(),
+        ..RunArgs::default()
+    };
+    let run = match &cli.command {
+        Subcommands::Train(train) => train.run.clone(),
+        Subcommands::Simulate(run) => run.clone(),
+        Subcommands::Play(play) => play.run.clone(),
+        Subcommands::Handover(handover) => only_settings(&handover.set),
+        Subcommands::Replay(replay) => only_settings(&replay.set),
+        _ => return None,
+    };
+    validated(&run).err()
+}
+
+/// Validates the settings of a run as its start does, on its preset. Files that only the reader has are left out.
+fn validated(run: &RunArgs) -> Result<(), String> {
+    let text = |error: ConfigError| format!("{:?}", miette::Report::new(error));
+    let run = run.with_shorthands().map_err(|error| format!("{error:?}"))?;
+    let mut settings = LayeredSettings::defaults().map_err(text)?;
+    if let Some(config) = &run.config {
+        match settings.clone().with_preset(config) {
+            Some(preset) => settings = preset.map_err(text)?,
+            None if config.contains('.') || config == "CONFIG" || config == "SCENARIO" => {}
+            None => return Err(format!("there is no preset {config}")),
+        }
+    }
+    let settings = settings.with_assignments(&run.set).map_err(text)?;
+    settings.validate().map(drop).map_err(text)
+}
+
+/// A block `toml` of a page is a configuration file, whole.
+#[test]
+fn every_configuration_is_valid() {
+    let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("documentation.toml");
+    let (mut refused, mut count) = (Vec::new(), 0);
+    for page in pages() {
+        let (mut begin, mut block) = (0, String::new());
+        // The line behind the last one ends a block at the end of a page.
+        let lines = page.lines().into_iter().chain([(usize::MAX, "", None)]);
+        for (number, line, language) in lines {
+            if language == Some("toml") {
+                begin = if block.is_empty() { number } else { begin };
+                block += line;
+                block += "\n";
+                continue;
+            }
+            if block.is_empty() {
+                continue;
+            }
+            count += 1;
+            std::fs::write(&file, std::mem::take(&mut block)).unwrap();
+            let settings = LayeredSettings::defaults().and_then(|settings| settings.with_file(&file));
+            if let Err(error) = settings.and_then(|settings| settings.validate()) {
+                let why = miette::Report::new(error);
+                refused.push(format!("{}:{begin}: {why:?}", page.path.display()));
+            }
+        }
+    }
+    assert!(count > 8, "{count} configurations found");
+    assert_none(&refused);
 }
 
 #[test]
@@ -206,8 +292,8 @@ fn every_command_line_parses() {
                         begun = continued.to_owned();
                         continue;
                     }
-                    if begun.starts_with("caraware ") {
-                        check(number, &begun, false);
+                    if let Some(command) = command_line(&begun) {
+                        check(number, &command, false);
                     }
                     begun.clear();
                 }

@@ -27,7 +27,7 @@ Exit codes: 0 done, 1 refused or no answer, 2 usage error."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Sends one command and prints the answer."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
         session = access.connect(options.endpoint, options.timeout, access.credentials_from(options))
         try:
@@ -81,7 +81,8 @@ def command_from(options: argparse.Namespace) -> ControlCommand:
     return command
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
     parser = argparse.ArgumentParser(
         prog="caraware-viewer command",
         description="Send a command to a run on another host. The run's `fanout.commanders` must name you.",

@@ -23,8 +23,9 @@ from caraware_viewer.page import Page
 HOST = "127.0.0.1"
 GRPC_PORT = 9876
 WEB_PORT = 9090
-SERVER_MEMORY = "128MiB"
-"""Most data that rerun's server keeps for browsers that join later; it drops the oldest."""
+SERVER_MEMORY_MIB = 8.0
+"""Data that rerun's server keeps for browsers that join later, beside the map; it drops the oldest. A browser goes
+through all of it before it shows the present."""
 WINDOW_MEMORY = "1GiB"
 """Most memory of a window, which drops the oldest data. A browser has no such setting: there rerun's is 2.3 GiB."""
 
@@ -73,11 +74,14 @@ class Display:
         return cls(process, port)
 
     @classmethod
-    def web(cls, web_port: int | None = None) -> Display:
-        """Serves browsers at `web_port`; without one, at 9090 if it is free, else at another port."""
+    def web(cls, web_port: int | None = None, memory_mib: float = SERVER_MEMORY_MIB) -> Display:
+        """Serves browsers at `web_port`; without one, at 9090 if it is free, else at another port.
+
+        rerun's server keeps `memory_mib` for browsers that join later.
+        """
         grpc_port, upstream_port = free_port(GRPC_PORT), free_port(0)
         ports = ("--port", str(grpc_port), "--web-viewer-port", str(upstream_port))
-        process = _start("--serve-web", *ports, "--server-memory-limit", SERVER_MEMORY)
+        process = _start("--serve-web", *ports, "--server-memory-limit", f"{memory_mib:.0f}MiB")
         try:
             _wait_for(process, grpc_port)
             _wait_for(process, upstream_port)

@@ -16,6 +16,7 @@ from caraware_viewer import cloud, detail, geometry, memory, plots, space, top, 
 from caraware_viewer.canvas import Canvas
 from caraware_viewer.course import Course
 from caraware_viewer.detail import Detail, Region
+from caraware_viewer.display import SERVER_MEMORY_MIB
 from caraware_viewer.documents import RoadUserCounts, RunMap, RunStatus
 from caraware_viewer.hud import ViewerFigures, hanging, hud
 from caraware_viewer.legend import draw_legend
@@ -30,8 +31,10 @@ HUD = "hud"
 _CONTACT_S = 5.0
 """Simulated time for which a contact stays on the map."""
 _MEMORY_INTERVAL_S = 2.0
-_REPEAT_BYTES = 48_000_000
-"""After so many bytes the map and the curves are sent to the display again: rerun's server keeps the newest 256 MiB."""
+_MAPS_KEPT = 6
+"""Times that the map fits into what rerun's server keeps."""
+_REPEATS_KEPT = 3
+"""Times that map and curves are sent again within what rerun's server keeps, so that a new browser finds them."""
 _AGES = 20_000
 """Newest frames whose ages count in the summary."""
 _RATE_FRAMES = 20
@@ -90,12 +93,8 @@ class Scene:
         *,
         live: rr.RecordingStream | None = None,
         region: Region | None = None,
-        display_pid: int | None = None,
     ) -> None:
-        """`recording` keeps the history of the run, and `live` shows its present; either may be missing.
-
-        `display_pid` is rerun's process, whose memory the HUD shows.
-        """
+        """`recording` keeps the history of the run, and `live` shows its present; either may be missing."""
         try:
             self._canvas = Canvas(recording, float(run_map["tick_s"]), live)
             x_min, y_min, x_max, y_max = (float(value) for value in run_map["map"]["bounds_m"])
@@ -112,7 +111,8 @@ class Scene:
         self._region, self._extent_m = region, max(x_max - x_min, y_max - y_min)
         self._detail: Detail | None = None
         self._routes_drawn = False
-        self._display_pid = display_pid
+        self.display_pid: int | None = None
+        """rerun's process, whose memory the HUD shows."""
         self._memory_mb = (float("nan"), float("nan"))
         self._memory_at_s = float("-inf")
         self._repeated_bytes = 0
@@ -126,9 +126,11 @@ class Scene:
         self.skipped = 0
         """Frames that were not drawn because newer ones had arrived, as the link counts them."""
         self._stop_lines = _stop_lines(run_map)
-        draw_map(self._canvas, run_map)
+        self._paint = draw_map(self._canvas, run_map)
         draw_legend(self._canvas)
         plots.name_series(self._canvas)
+        self.server_mib = SERVER_MEMORY_MIB + _MAPS_KEPT * self._canvas.live_bytes / 2**20
+        """What rerun's server has to keep, so that a new browser finds the map in it."""
 
     def cloud_vehicles(self) -> list[str]:
         """SUMO ids of the vehicles whose point clouds are shown."""
@@ -201,11 +203,12 @@ class Scene:
         self._draw_contacts(world.header)
         self._draw_routes(rows[0] if rows else None)
         if rows:
+            self._paint.follow(np.array([rows[0]["x_m"], rows[0]["y_m"]]))
             self._canvas.scalar(plots.SPEED, float(np.hypot(*rows[0]["velocity_body_mps"][:2])))
         figures = self._figures()
         self._tally.add(self._drawn_at[-1], sample.age_ms(), figures)
         self._draw_hud(figures)
-        if self._canvas.live_bytes - self._repeated_bytes > _REPEAT_BYTES:
+        if self._canvas.live_bytes - self._repeated_bytes > self.server_mib * 2**20 / _REPEATS_KEPT:
             self._canvas.repeat_static()
             self._course.repeat(self._canvas)
             self._repeated_bytes = self._canvas.live_bytes
@@ -220,7 +223,7 @@ class Scene:
         now_s = self._clock()
         if now_s - self._memory_at_s > _MEMORY_INTERVAL_S:
             self._memory_at_s = now_s
-            self._memory_mb = (memory.resident_mb(), memory.resident_mb(self._display_pid))
+            self._memory_mb = (memory.resident_mb(), memory.resident_mb(self.display_pid))
         return ViewerFigures(rate, self._age_ms, self.lost, self.refused, self.skipped, *self._memory_mb)
 
     def _shown(self, observation: wire.Observation) -> NDArray[np.bool_]:

@@ -8,10 +8,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from caraware_viewer import solid
+from caraware_viewer import paint, solid
 from caraware_viewer.canvas import Canvas, on_screen
 from caraware_viewer.documents import Area, Building, Lane, Obstacle, RunMap, SceneDocument
 from caraware_viewer.geometry import hatching_m, quaternions
+from caraware_viewer.paint import CROSSING_COLOR, MARKING_COLOR, MARKING_M, ROAD_KINDS, STRIPE_M, RoadPaint
 from caraware_viewer.wire import FrameError
 
 BOUNDS = "top/map/bounds"
@@ -27,40 +28,37 @@ SPACE_GROUND = "space/world/ground"
 SPACE_ROADS = "space/world/roads"
 SPACE_JUNCTIONS = "space/world/junctions"
 SPACE_WALKS = "space/world/walks"
-SPACE_CROSSINGS = "space/world/crossings"
-SPACE_MARKINGS = "space/world/markings"
 SPACE_BUILDINGS = "space/world/buildings"
 SPACE_OBSTACLES = "space/world/obstacles"
 
-ROAD_COLOR, WALK_COLOR, CROSSING_COLOR = [52, 56, 64], [84, 82, 78], [150, 150, 146]
-MARKING_COLOR, BUILDING_COLOR, WALL_COLOR = [196, 198, 200], [104, 88, 74], [150, 128, 108]
+ROAD_COLOR, WALK_COLOR = [52, 56, 64], [84, 82, 78]
+BUILDING_COLOR, WALL_COLOR = [104, 88, 74], [150, 128, 108]
 OBSTACLE_COLOR, BOUNDS_COLOR, SCALE_COLOR = [255, 127, 80], [70, 74, 84], [210, 214, 220]
 GROUND_COLOR, ROOF_COLOR = [38, 42, 44], [142, 120, 100]
 
-_ROAD_KINDS = ("car", "bus", "bicycle", "rail")
-_MARKING_M = 0.12
-_DASH_M, _GAP_M = 3.0, 6.0
-_STRIPE_M = 0.5
-_MAX_HATCHES = 60_000
-"""Most segments that fill polygons; a larger map has its rows farther apart."""
+MAX_LINES = 8_000
+"""Most lanes, lines of paint, and segments that fill polygons. A larger map shows less of each: it is drawn again for
+every frame, and a browser without a graphics card takes a microsecond for a corner of a line."""
 _MIN_SPACING_M = 0.5
 SCALE_BELOW = 0.035
 """Distance of the scale bar from the map, as a share of its height."""
 
 
-def draw_map(canvas: Canvas, run_map: RunMap) -> None:
-    """Draws the static map; of a map without a scene, only the bounds."""
+def draw_map(canvas: Canvas, run_map: RunMap) -> RoadPaint:
+    """Draws the static map; of a map without a scene, only the bounds. Returns the paint, which follows a vehicle."""
     try:
         _draw_bounds(canvas, run_map["map"]["bounds_m"])
         scene = run_map.get("scene") or SceneDocument()
         lanes, areas = scene.get("lanes", []), scene.get("areas", [])
+        lanes = shown_lanes(lanes, areas)
         _draw_lanes(canvas, lanes)
         _draw_polygons(canvas, JUNCTIONS, [a for a in areas if a["kind"] == "junction"], ROAD_COLOR, 2.0)
         _draw_polygons(canvas, WALKS + "/areas", [a for a in areas if a["kind"] == "walking_area"], WALK_COLOR, 2.5)
         _draw_buildings(canvas, scene.get("buildings", []))
         _draw_obstacles(canvas, scene.get("obstacles", []))
         _draw_scale(canvas, run_map["map"]["bounds_m"])
-        _draw_surfaces(canvas, run_map["map"]["bounds_m"], scene)
+        _draw_surfaces(canvas, run_map["map"]["bounds_m"], lanes, scene)
+        return RoadPaint(canvas, lanes, MAX_LINES)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise FrameError(f"the map cannot be read: {error!r}") from error
 
@@ -71,15 +69,23 @@ def _draw_bounds(canvas: Canvas, bounds_m: list[float]) -> None:
     canvas.log(BOUNDS, rr.LineStrips2D([on_screen(corners)], colors=BOUNDS_COLOR, draw_order=0.0), static=True)
 
 
+def shown_lanes(lanes: list[Lane], areas: list[Area]) -> list[Lane]:
+    """The lanes that are drawn: of very many those outside junctions, whose areas are drawn."""
+    if len(lanes) <= MAX_LINES or not any(area["kind"] == "junction" for area in areas):
+        return lanes
+    return [lane for lane in lanes if not lane["inside"]]
+
+
 def _draw_lanes(canvas: Canvas, lanes: list[Lane]) -> None:
-    """Draws each lane as a strip of its width; lanes inside a junction have no markings."""
-    roads = [lane for lane in lanes if lane["kind"] in _ROAD_KINDS]
+    """Draws each lane as a strip of its width, with as much of its paint as there is room for."""
+    roads = [lane for lane in lanes if lane["kind"] in ROAD_KINDS]
     _strips(canvas, ROADS, roads, ROAD_COLOR, 1.0)
     _strips(canvas, WALKS, [lane for lane in lanes if lane["kind"] == "sidewalk"], WALK_COLOR, 1.5)
-    stripes = [stripe for lane in lanes if lane["kind"] == "crossing" for stripe in stripes_m(lane)]
-    _segments(canvas, CROSSINGS, stripes, CROSSING_COLOR, _STRIPE_M / 2, 4.0)
-    markings = [piece for lane in roads if not lane["inside"] for piece in markings_m(lane)]
-    _segments(canvas, MARKINGS, markings, MARKING_COLOR, _MARKING_M / 2, 5.0)
+    for path, lines, color, width_m, order in (
+        (CROSSINGS, paint.crossings(lanes, MAX_LINES), CROSSING_COLOR, STRIPE_M, 4.0),
+        (MARKINGS, paint.markings(lanes, MAX_LINES), MARKING_COLOR, MARKING_M, 5.0),
+    ):
+        _segments(canvas, path, [line for _, pieces in lines for line in pieces], color, width_m / 2, order)
 
 
 def _draw_scale(canvas: Canvas, bounds_m: list[float]) -> None:
@@ -107,10 +113,10 @@ def scale_m(width_m: float) -> float:
     return float(power * max(step for step in (1, 2, 5) if step * power <= longest))
 
 
-def _draw_surfaces(canvas: Canvas, bounds_m: list[float], scene: SceneDocument) -> None:
+def _draw_surfaces(canvas: Canvas, bounds_m: list[float], lanes: list[Lane], scene: SceneDocument) -> None:
     """Draws the surfaces of the 3-D view, each a little above the one below, so that the nearer one is seen."""
-    lanes, polygons, buildings = scene.get("lanes", []), scene.get("areas", []), scene.get("buildings", [])
-    roads = [lane for lane in lanes if lane["kind"] in _ROAD_KINDS]
+    polygons, buildings = scene.get("areas", []), scene.get("buildings", [])
+    roads = [lane for lane in lanes if lane["kind"] in ROAD_KINDS]
     heights_m = [point[2] for lane in lanes for point in lane["points_m"]]
     surfaces = {
         SPACE_GROUND: solid.ground(bounds_m, min(heights_m, default=0.0) - 0.1, GROUND_COLOR),
@@ -123,68 +129,6 @@ def _draw_surfaces(canvas: Canvas, bounds_m: list[float], scene: SceneDocument) 
     for path, surface in surfaces.items():
         if len(surface.corners_m):
             canvas.log(path, surface.mesh(), static=True)
-    painted = {
-        SPACE_MARKINGS: ([(lane, markings_m(lane)) for lane in roads if not lane["inside"]], MARKING_COLOR, _MARKING_M),
-        SPACE_CROSSINGS: (
-            [(lane, stripes_m(lane)) for lane in lanes if lane["kind"] == "crossing"],
-            CROSSING_COLOR,
-            _STRIPE_M,
-        ),
-    }
-    for path, (lines, color, width_m) in painted.items():
-        strips = [_lifted(line, lane) for lane, pieces in lines for line in pieces]
-        if strips:
-            canvas.log(path, rr.LineStrips3D(strips, colors=color, radii=width_m / 2), static=True)
-
-
-def _lifted(line_m: NDArray[np.float64], lane: Lane) -> NDArray[np.float32]:
-    """A painted line `[n, 3]`, just above its lane at the nearest point of the centre line."""
-    centre_m = np.asarray(lane["points_m"], np.float64)
-    distance_m = np.linalg.norm(line_m[:, None] - centre_m[None, :, :2], axis=-1)
-    return np.column_stack([line_m, centre_m[distance_m.argmin(axis=1), 2] + 0.05]).astype(np.float32)
-
-
-def edge_m(lane: Lane, side: int) -> NDArray[np.float64]:
-    """Edge `[n, 2]` of a lane: to the left of its direction for `side` 1, to the right for -1."""
-    line = np.asarray(lane["points_m"], np.float64)[:, :2]
-    along = np.gradient(line, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    edge: NDArray[np.float64] = line + side * lane["width_m"] / 2 * np.column_stack([-along[:, 1], along[:, 0]])
-    return edge
-
-
-def markings_m(lane: Lane) -> list[NDArray[np.float64]]:
-    """Painted lines of a lane's edges; a dashed line is a list of pieces."""
-    pieces = []
-    for side, marking in ((1, lane["left"]), (-1, lane["right"])):
-        if marking == "solid":
-            pieces.append(edge_m(lane, side))
-        elif marking == "dashed":
-            pieces += pieces_m(edge_m(lane, side), _DASH_M, _GAP_M)
-    return pieces
-
-
-def stripes_m(lane: Lane) -> list[NDArray[np.float64]]:
-    """Stripes of a crossing, in the direction of the traffic that it crosses."""
-    line = np.asarray(lane["points_m"], np.float64)[:, :2]
-    stripes = []
-    for piece in pieces_m(line, _STRIPE_M, _STRIPE_M):
-        along = piece[-1] - piece[0]
-        across = (
-            np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9) * (lane["width_m"] / 2 - _STRIPE_M / 2)
-        )
-        stripes.append(piece.mean(axis=0) + np.array([across, -across]))
-    return stripes
-
-
-def pieces_m(line_m: NDArray[np.float64], piece_m: float, gap_m: float) -> list[NDArray[np.float64]]:
-    """Pieces `[2, 2]` of a line, with gaps between them; the last piece may be shorter."""
-    steps_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
-    at_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    begins = np.arange(0.0, at_m[-1], piece_m + gap_m)
-    ends = np.minimum(begins + piece_m, at_m[-1])
-    both = np.stack([begins, ends], axis=1)
-    return list(np.stack([np.interp(both, at_m, line_m[:, axis]) for axis in range(2)], axis=-1))
 
 
 def _strips(canvas: Canvas, path: str, lanes: list[Lane], color: list[int], order: float) -> None:
@@ -196,7 +140,12 @@ def _strips(canvas: Canvas, path: str, lanes: list[Lane], color: list[int], orde
 
 
 def _segments(
-    canvas: Canvas, path: str, lines: Sequence[NDArray[np.floating]], color: list[int], radius_m: float, order: float
+    canvas: Canvas,
+    path: str,
+    lines: Sequence[NDArray[np.floating]],
+    color: list[int],
+    radius_m: float | Sequence[float],
+    order: float,
 ) -> None:
     if lines:
         strips = [on_screen(line) for line in lines]
@@ -210,10 +159,31 @@ def _draw_polygons(
     outlines = [outline for outline in outlines if len(outline) > 2]
     if not outlines:
         return
-    rows_m = sum(float(np.ptp(outline[:, 1])) for outline in outlines)
-    spacing_m = max(_MIN_SPACING_M, rows_m / _MAX_HATCHES)
-    filling = [segment for outline in outlines for segment in hatching_m(outline, spacing_m)]
-    _segments(canvas, path, filling, color, 0.55 * spacing_m, order)
+    filling, radii_m = filling_m(outlines)
+    _segments(canvas, path, filling, color, radii_m, order)
+
+
+def filling_m(outlines: Sequence[NDArray[np.float64]]) -> tuple[list[NDArray[np.float32]], list[float]]:
+    """Segments `[2, 2]` that fill polygons `[n, 2]`, and their radii: the larger the map, the wider they are.
+
+    They run along the longer side. A segment ends in a half circle, so a wide one is shorter at both ends.
+    """
+    shorter_m = [float(np.ptp(outline, axis=0).min()) for outline in outlines]
+    spacing_m = max(_MIN_SPACING_M, sum(shorter_m) / MAX_LINES)
+    filling: list[NDArray[np.float32]] = []
+    radii_m: list[float] = []
+    for outline, width_m in zip(outlines, shorter_m, strict=True):
+        own_m = max(width_m, 0.01) / np.ceil(max(width_m, 0.01) / spacing_m)
+        is_tall = np.ptp(outline[:, 1]) > np.ptp(outline[:, 0])
+        # Where a segment is less than a pixel, its smooth edges would let the ground through.
+        radius_m = (0.55 if own_m <= _MIN_SPACING_M else 0.7) * own_m
+        inset_m = np.array([max(0.0, radius_m - 0.55 * _MIN_SPACING_M), 0.0], np.float32)
+        for segment in hatching_m(outline[:, ::-1] if is_tall else outline, float(own_m)):
+            half = np.minimum(inset_m, (segment[1] - segment[0]) * 0.49)
+            inside = segment + np.array([half, -half])
+            filling.append(inside[:, ::-1] if is_tall else inside)
+            radii_m.append(radius_m)
+    return filling, radii_m
 
 
 def _draw_buildings(canvas: Canvas, buildings: list[Building]) -> None:

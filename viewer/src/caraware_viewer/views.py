@@ -15,7 +15,7 @@ from caraware_viewer.legend import LEGEND
 from caraware_viewer.static_map import SCALE_BELOW
 
 _MARGIN = 0.02
-_BACKGROUND = [20, 23, 29]
+BACKGROUND = [20, 23, 29]
 MAX_PLOTS = 5
 """Most plots beside one another; the first rows of `PLOTS` come first."""
 
@@ -109,13 +109,13 @@ def _top_view(bounds_m: Sequence[float]) -> rrb.Spatial2DView:
         x_range=[x_min - x_margin, x_max + x_margin],
         y_range=[-y_max - y_margin, -y_min + y_margin + below],
     )
-    return rrb.Spatial2DView(name="Top view", origin="/top", background=_BACKGROUND, visual_bounds=visible)
+    return rrb.Spatial2DView(name="Top view", origin="/top", background=BACKGROUND, visual_bounds=visible)
 
 
 def _legend() -> rrb.Spatial2DView:
     visible = rrb.VisualBounds2D(x_range=[0.0, LEGEND.width], y_range=[0.0, LEGEND.height])
     return rrb.Spatial2DView(
-        name="Legend", origin="/legend", background=_BACKGROUND, visual_bounds=visible, titlebar=False
+        name="Legend", origin="/legend", background=BACKGROUND, visual_bounds=visible, titlebar=False
     )
 
 
@@ -130,7 +130,7 @@ def _space() -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         name="Around the followed vehicle",
         origin="/space",
-        background=_BACKGROUND,
+        background=BACKGROUND,
         line_grid=False,
         eye_controls=eye,
     )
@@ -140,7 +140,7 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name=plot.title,
         origin=f"/{plot.path}",
-        background=rrb.archetypes.PlotBackground(color=_BACKGROUND),
+        background=rrb.archetypes.PlotBackground(color=BACKGROUND),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=plot.path in _SHARED),
         # Without a range, rerun shows a part around the cursor.
         axis_x=rrb.TimeAxis(

@@ -8,6 +8,7 @@ import os
 import sys
 import threading
 import time
+from dataclasses import dataclass
 
 import rerun as rr
 
@@ -16,12 +17,17 @@ from caraware_viewer.detail import Region
 from caraware_viewer.display import Display, has_screen
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import RunLink, connect, find_run
+from caraware_viewer.page import Pace
 from caraware_viewer.scene import Scene
 from caraware_viewer.views import blueprint, layout_of, mode_of
 from caraware_viewer.wire import FrameError
 
 _POLL_INTERVAL_S = 0.1
 _FLUSH_LIMIT_S = 5.0
+_LONGEST_INTERVAL_S = 5.0
+"""Longest time between two ticks, however slow a browser is."""
+_FRAMES_OF_A_TICK = 2.0
+"""Frames that a page draws while the data of a tick comes in."""
 
 
 def watch_run(options: argparse.Namespace) -> int:
@@ -32,37 +38,35 @@ def watch_run(options: argparse.Namespace) -> int:
     except BaseException:
         session.close()
         raise
-    with RunLink(session, run) as link, _open_display(options) as display:
+    with RunLink(session, run) as link:
         run_map = link.map(options.timeout)
-        kept, live = _recordings(options, display, f"{run.run}/{run.env}")
-        recordings = [recording for recording in (kept, live) if recording is not None]
-        print(f"watching run {run.run} at {options.endpoint}", file=sys.stderr)
-        if display is not None and display.page is not None:
-            print(f"open {display.page.url} in a browser", file=sys.stderr)
-        scene = Scene(
-            kept,
-            run_map,
-            options.vehicle,
-            options.lidar,
-            live=live,
-            region=options.region,
-            display_pid=None if display is None else display.pid,
-        )
-        layout = Layout(recordings, run_map, options.region)
-        layout.arrange(scene)
-        drawing = threading.Thread(
-            target=_draw_frames, args=(link, scene, layout, options.rate), name="draw", daemon=True
-        )
-        drawing.start()
-        try:
-            _wait_for_end(drawing, link, display)
-        finally:
-            link.frames.close()
-            _finish(recordings, drawing, display)
-            if scene.summary():
-                print(scene.summary(), file=sys.stderr)
+        kept, live = _recordings(options, f"{run.run}/{run.env}")
+        scene = Scene(kept, run_map, options.vehicle, options.lidar, live=live, region=options.region)
+        with _open_display(options, scene.server_mib) as display:
+            _connect(live, options, display)
+            scene.display_pid = None if display is None else display.pid
+            _show(link, scene, Layout([one for one in (kept, live) if one], run_map, options.region), options, display)
     print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
     return 0
+
+
+def _show(link: RunLink, scene: Scene, layout: Layout, options: argparse.Namespace, display: Display | None) -> None:
+    """Draws frames until the run ends or the display is closed."""
+    print(f"watching run {link.run.run} at {options.endpoint}", file=sys.stderr)
+    if display is not None and display.page is not None:
+        print(f"open {display.page.url} in a browser", file=sys.stderr)
+    layout.arrange(scene)
+    page = None if display is None else display.page
+    rate = FrameRate(options.rate, None if page is None else page.pace, keeps=bool(options.save))
+    drawing = threading.Thread(target=_draw_frames, args=(link, scene, layout, rate), name="draw", daemon=True)
+    drawing.start()
+    try:
+        _wait_for_end(drawing, link, display)
+    finally:
+        link.frames.close()
+        _finish(layout.recordings, drawing, display)
+        if scene.summary():
+            print(scene.summary(), file=sys.stderr)
 
 
 def _wait_for_end(drawing: threading.Thread, link: RunLink, display: Display | None) -> None:
@@ -97,7 +101,7 @@ class Layout:
     """Arranges the views of all recordings by what the run has so far."""
 
     def __init__(self, recordings: list[rr.RecordingStream], run_map: RunMap, region: Region | None) -> None:
-        self._recordings, self._map, self._region = recordings, run_map, region
+        self.recordings, self._map, self._region = recordings, run_map, region
         self._shown: object = None
 
     def arrange(self, scene: Scene) -> None:
@@ -108,11 +112,29 @@ class Layout:
             return
         self._shown = shown
         views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region)
-        for recording in self._recordings:
+        for recording in self.recordings:
             recording.send_blueprint(views, make_active=True, make_default=True)
 
 
-def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float) -> None:
+@dataclass(frozen=True)
+class FrameRate:
+    """How often a tick is drawn."""
+
+    most_hz: float
+    pace: Pace | None
+    """That of the open pages; None without a page."""
+    keeps: bool
+    """A file keeps what is drawn, whether a page is open or not."""
+
+    def interval_s(self) -> float:
+        """Time between two ticks: what the slowest page needs, and seldom if no page is open."""
+        frame_s = 0.0 if self.pace is None else self.pace.frame_s()
+        is_seen = self.pace is None or frame_s > 0.0
+        wanted_s = _FRAMES_OF_A_TICK * frame_s if is_seen or self.keeps else _LONGEST_INTERVAL_S
+        return max(1 / self.most_hz, min(wanted_s, _LONGEST_INTERVAL_S))
+
+
+def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate: FrameRate) -> None:
     reported: set[str] = set()
     while True:
         begun_s = time.monotonic()
@@ -134,31 +156,40 @@ def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float) ->
             return
         link.subscribe_clouds(scene.cloud_vehicles())
         # Meanwhile newer frames replace those that wait.
-        link.frames.wait_for_close(1 / rate_hz - (time.monotonic() - begun_s))
+        link.frames.wait_for_close(rate.interval_s() - (time.monotonic() - begun_s))
 
 
 def _recordings(
-    options: argparse.Namespace, display: Display | None, recording_id: str
+    options: argparse.Namespace, recording_id: str
 ) -> tuple[rr.RecordingStream | None, rr.RecordingStream | None]:
-    """The recording that keeps the history, in a file, and the one that shows the present."""
+    """The recording that keeps the history, in a file, and the one that shows the present, once it has its sinks."""
     kept = live = None
     if options.save:
         kept = rr.RecordingStream("caraware", recording_id=recording_id)
         kept.set_sinks(rr.FileSink(options.save))
-    urls = [options.connect] if options.connect else []
-    urls += [display.url] if display is not None else []
-    if urls:
+    if options.connect or _wants_display(options):
         live = rr.RecordingStream("caraware", recording_id=recording_id)
-        live.set_sinks(*(rr.GrpcSink(url) for url in urls))
     return kept, live
 
 
-def _open_display(options: argparse.Namespace) -> contextlib.AbstractContextManager[Display | None]:
-    if options.web or options.web_port:
-        return Display.web(options.web_port)
-    if options.save or options.connect:
+def _connect(live: rr.RecordingStream | None, options: argparse.Namespace, display: Display | None) -> None:
+    """Sends the live recording, with what it has already, to where it is shown."""
+    urls = [options.connect] if options.connect else []
+    urls += [display.url] if display is not None else []
+    if live is not None:
+        live.set_sinks(*(rr.GrpcSink(url) for url in urls))
+
+
+def _wants_display(options: argparse.Namespace) -> bool:
+    return bool(options.web or options.web_port or not (options.save or options.connect))
+
+
+def _open_display(options: argparse.Namespace, memory_mib: float) -> contextlib.AbstractContextManager[Display | None]:
+    if not _wants_display(options):
         return contextlib.nullcontext()
+    if options.web or options.web_port:
+        return Display.web(options.web_port, memory_mib)
     if not has_screen():
         print("no screen was found (DISPLAY is not set): serving a browser instead, as with --web", file=sys.stderr)
-        return Display.web()
+        return Display.web(memory_mib=memory_mib)
     return Display.window()

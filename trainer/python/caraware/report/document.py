@@ -286,8 +286,8 @@ def _directory(argument: Path, runs: Path) -> Path:
     return argument if argument.is_dir() or not (runs / argument).is_dir() else runs / argument
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Write the document; 2 for input that cannot be used."""
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
     parser = argparse.ArgumentParser(
         prog="caraware report",
         description="Writes what runs have reached, with plots and a comparison of several.",
@@ -296,7 +296,12 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--format", choices=["md", "html"], default="md", help="Markdown and pictures, or one file")
     parser.add_argument("--output", type=Path, help="directory to write to [default: report in the first run's]")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="directory that holds run directories")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write the document; 2 for input that cannot be used."""
+    options = parser().parse_args(arguments)
     try:
         runs = [FinishedRun(_directory(argument, options.runs)) for argument in options.run]
         pictures = plots(runs)

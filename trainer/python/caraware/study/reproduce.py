@@ -63,8 +63,8 @@ def compare(measured: Measured, expected: Mapping[str, ExpectedFigure]) -> list[
     return wrong
 
 
-def main(arguments: Sequence[str]) -> int:
-    """0 where every figure lies in its interval, 1 where one does not, 2 for a wrong command."""
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
     listed = "\n".join(f"  {name:12} {table.title} ({table.page})" for name, table in TABLES.items())
     parser = argparse.ArgumentParser(
         prog="caraware reproduce",
@@ -81,9 +81,14 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--seeds", type=int, default=5, help="whole runs, each with a seed of its own (default 5)")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="the file with the intervals")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: Sequence[str]) -> int:
+    """0 where every figure lies in its interval, 1 where one does not, 2 for a wrong command."""
+    options = parser().parse_args(arguments)
     if options.seeds < 1:
-        parser.error("--seeds: give at least 1")
+        parser().error("--seeds: give at least 1")
     try:
         expected = expected_figures(options.figures, options.table)
     except FiguresError as error:
