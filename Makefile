@@ -46,8 +46,8 @@ timed-programs:
 programs:
 	$(CARGO) build $(CARGO_FLAGS)
 
-# One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
-# them again.
+# One selection of targets for the tests and the extension. Third-party crates have the features of `programs` (fanout/Cargo.toml
+# says how), so neither compiles them again after the other.
 programs-and-tests:
 	$(CARGO) build $(CARGO_FLAGS) --lib --bins --tests --examples
 
@@ -106,8 +106,8 @@ install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/
 image: ## a container image of Containerfile, by podman, buildah or docker
 	scripts/image.sh caraware GPU=$(GPU)
 
-# A test thread more than cores: most tests start whole runs, which wait for each other much of the time. No crate has documentation
-# tests.
+# A test thread more than cores: most tests start whole runs, which wait for each other much of the time. `--tests` leaves out
+# documentation tests, of which no crate has any.
 test-rust: programs-and-tests
 	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} $(CARGO) test $(CARGO_FLAGS) --no-fail-fast --tests
 
@@ -126,10 +126,10 @@ newcomer: build ## every command block of README and docs, also those that the t
 # The tests look at fewer deaths, preemptions and frames. Miri needs a nightly toolchain: rustup toolchain install nightly --component miri,rust-src
 model: prerequisites $(VENV)/.installed ## the models and the parsers for longer than in the tests, the unsafe parts under Miri: about an hour
 	CARAWARE_MODEL_DEATHS=3,3 $(CARGO) test $(CARGO_FLAGS) --test protocol_model
-	CARAWARE_LOOM_PREEMPTIONS=4 cargo test $(CARGO_FLAGS) --test boards_under_loom
-	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test hostile_frames
-	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test messages
-	CARAWARE_FUZZ_FRAMES=1000000 cargo test $(CARGO_FLAGS) --test fanout a_flood
+	CARAWARE_LOOM_PREEMPTIONS=4 $(CARGO) test $(CARGO_FLAGS) --test boards_under_loom
+	CARAWARE_FUZZ_FRAMES=100000000 $(CARGO) test $(CARGO_FLAGS) --test hostile_frames
+	CARAWARE_FUZZ_FRAMES=100000000 $(CARGO) test $(CARGO_FLAGS) --test messages
+	CARAWARE_FUZZ_FRAMES=1000000 $(CARGO) test $(CARGO_FLAGS) --test fanout a_flood
 	cd viewer && CARAWARE_FUZZ_FRAMES=7000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
 	$(MIRI) -- --skip noise::
 	export MIRIFLAGS="-Zmiri-disable-data-race-detector -Zmiri-many-seeds=0..64"; $(MIRI) --features racing-board -- a_board_that

@@ -102,7 +102,9 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let (missed, message_mb_per_s) = (run.missed_ticks, run.message_mb / run.recorded_s.max(1e-9));
     run.stop()?;
-    report(&size, &ratios, missed, message_mb_per_s, load.trim())
+    let mut report = report(&size, &ratios, missed, message_mb_per_s, load.trim())?;
+    report.command = format!("caraware bench watch --minutes {}", options.minutes);
+    Ok(report)
 }
 
 fn report(

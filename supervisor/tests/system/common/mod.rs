@@ -37,7 +37,7 @@ pub const BARE_NET_SETTINGS: [&str; 6] = [
     "fanout.enabled=false",
 ];
 
-/// How many tests of a file have a workplace. A whole run has several processes, which wait for each other much of the time.
+/// How many tests have a workplace. A whole run has several processes, which wait for each other much of the time.
 static TAKEN: Mutex<usize> = Mutex::new(0);
 static RETURNED: Condvar = Condvar::new();
 
