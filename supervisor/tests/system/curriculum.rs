@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::common::{CURRICULUM, Spectator, Workplace, short_pause};
+use crate::common::{CURRICULUM, Workplace, of_channel};
 use ipc_schema::{
     block,
     observation::{ObservationLayout, VALID},
@@ -25,12 +25,16 @@ const MORE: [&str; 3] = [
 ];
 
 fn arguments<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    [&unnamed(mode, more)[..], &["--name", name]].concat()
+}
+
+fn unnamed<'a>(mode: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     let settings = CURRICULUM
         .iter()
         .chain(&MORE)
         .chain(more)
         .flat_map(|setting| ["--set", setting]);
-    [mode, "paper", "--name", name].into_iter().chain(settings).collect()
+    [mode, "paper"].into_iter().chain(settings).collect()
 }
 
 fn decisions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
@@ -151,7 +155,7 @@ const MAPS: [&str; 5] = [
     "curriculum.stages=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
      {cavs=3,until_lessons=6,maps=[\"town\",\"city\"],map_choice=\"random\",noise=2.0},\
      {cavs=2,until_lessons=8,maps=[\"city\",\"town\"],map_choice=\"gradually_random\"}]",
-    "episode.ticks=120",
+    "episode.ticks=60",
     // The sky view depends on the buildings of each map.
     "gnss.sky_view=true",
     "traffic.others=0",
@@ -188,14 +192,18 @@ fn lessons_are_on_the_maps_of_their_stages_and_the_same_seed_gives_the_same_byte
     let expected = lessons_by_map(&workplace, "maps", &steps);
     assert!(expected.iter().all(|lessons| *lessons > 2), "{expected:?}");
     for (map, (name, lessons)) in ["town", "city"].into_iter().zip(expected).enumerate() {
-        let usage = serde_json::json!({"name": name, "lessons": lessons, "ticks": 120 * lessons});
+        let usage = serde_json::json!({"name": name, "lessons": lessons, "ticks": 60 * lessons});
         assert_eq!(maps[map], usage);
     }
 
     // Kills before the first checkpoint, and at borders between maps.
-    let mut child = workplace.command(&arguments("train", "killed", &MAPS)).spawn().unwrap();
+    let paced = [&MAPS[..], &["run.real_time_factor=30"]].concat();
+    let mut child = workplace
+        .command(&arguments("train", "killed", &paced))
+        .spawn()
+        .unwrap();
     let run = trainer_of(&workplace, "killed", &mut child);
-    for (incarnation, tick) in (0..).zip([120, 600, 1500]) {
+    for (incarnation, tick) in (0..).zip([60, 300, 750]) {
         kill_trainer(&run.1, incarnation, tick);
     }
     drop(run);
@@ -230,26 +238,17 @@ fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
 #[test]
 fn vehicles_are_on_the_map_that_their_tick_says() {
     let workplace = with_city();
-    let paced = [
+    let turns = [
         "curriculum.stages=[{cavs=12,maps=[\"town\",\"city\"]}]",
-        "episode.ticks=60",
-        "episode.training_episodes=150",
-        "run.real_time_factor=100",
+        "episode.training_episodes=30",
     ];
-    let mut child = workplace
-        .command(&arguments("simulate", "paced", &[&MAPS[..], &paced].concat()))
-        .spawn()
-        .unwrap();
-    let spectator = Spectator::join(&workplace.path().join("runs/paced/run.json"), &mut child);
-    let observations = spectator.subscribe(Channel::Observation);
+    let settings = [&MAPS[..], &turns].concat();
+    let recording = workplace.record("turns", &unnamed("simulate", &settings), &[Channel::Observation]);
     // Rows by map, and how many of them are on the grid.
-    let mut rows = [[0_u32; 2]; 2];
-    while child.try_wait().unwrap().is_none() {
-        let Some(message) = observations.receive().unwrap() else {
-            short_pause();
-            continue;
-        };
-        let header = message.header();
+    let (mut ticks, mut rows) = (0, [[0_u32; 2]; 2]);
+    for message in of_channel(&recording, Channel::Observation) {
+        ticks += 1;
+        let header = &message.header;
         let layout = ObservationLayout::of(header);
         let truth: &[[f32; 4]] = block::view(message.payload(), layout.truth).unwrap();
         let flags: &[u32] = block::view(message.payload(), layout.flags).unwrap();
@@ -262,8 +261,7 @@ fn vehicles_are_on_the_map_that_their_tick_says() {
             );
         }
     }
-    drop((observations, spectator));
-    assert!(child.wait().unwrap().success());
+    assert_eq!(ticks, 30 * 60 + 80, "the lessons and the evaluation");
     let [[town, by_chance], [city, on_grid]] = rows;
     assert!(town > 500 && city > 500, "{rows:?}");
     assert_eq!(city, on_grid);

@@ -1,24 +1,18 @@
 //! Suites in whole runs: vehicles with several cameras and LIDARs, and a mast beside the road.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    process::Stdio,
-};
+use std::collections::BTreeSet;
 
-use crate::common::{Spectator, Workplace, short_pause};
+use crate::common::{ONE_TICK_AHEAD, Workplace, of_channel, road_users};
 use ipc_schema::{
     block,
+    channel::Channel,
     image::{ImageHead, ImageLayout},
     pointcloud::{LidarPoint, PointcloudLayout, ROADSIDE_CARRIER, Scan},
-    services::Channel,
     traffic::id_hash,
-    world::{VehicleState, WorldLayout},
+    world::VehicleState,
 };
 
 const SUITES: &str = r#"
-[run]
-real_time_factor = 10.0
-
 [episode]
 training_episodes = 1
 ticks = 100
@@ -83,61 +77,6 @@ y_m = 126.0
 yaw_deg = 90.0
 "#;
 
-/// Heads by tick, carrier and sensor, and the objects that points lie on.
-#[derive(Default)]
-struct Watched {
-    images: BTreeMap<(u64, u32, u32), ImageHead>,
-    scans: BTreeMap<(u64, u32, u32), (Scan, BTreeSet<u32>)>,
-    world: BTreeMap<u64, Vec<VehicleState>>,
-}
-
-fn watch(workplace: &Workplace, config: &str) -> Watched {
-    let mut command = workplace.command(&["simulate", config, "--name", "watched"]);
-    let mut run = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let run_file = workplace.path().join("runs/watched/run.json");
-    let spectator = Spectator::join(&run_file, &mut run);
-    let [images, scans, world] =
-        [Channel::Image, Channel::Pointcloud, Channel::World].map(|channel| spectator.subscribe(channel));
-    let mut watched = Watched::default();
-    // A spectator may miss messages, even the last.
-    loop {
-        let over = run.try_wait().unwrap().is_some();
-        let mut news = 0;
-        while let Some(message) = images.receive().unwrap() {
-            let layout = ImageLayout::of(message.header());
-            let head = block::view::<ImageHead>(message.payload(), layout.head).unwrap()[0];
-            watched
-                .images
-                .insert((message.header().tick, head.vehicle, head.sensor), head);
-            news += 1;
-        }
-        while let Some(message) = scans.receive().unwrap() {
-            let layout = PointcloudLayout::of(message.header());
-            let scan = block::view::<Scan>(message.payload(), layout.scan).unwrap()[0];
-            let points: &[LidarPoint] = block::view(message.payload(), layout.points).unwrap();
-            let objects = points.iter().map(|point| point.object).collect();
-            watched
-                .scans
-                .insert((message.header().tick, scan.vehicle, scan.sensor), (scan, objects));
-            news += 1;
-        }
-        while let Some(message) = world.receive().unwrap() {
-            let layout = WorldLayout::of(message.header());
-            let states = block::view(message.payload(), layout.states).unwrap().to_vec();
-            watched.world.insert(message.header().tick, states);
-            news += 1;
-        }
-        if over && news == 0 {
-            break;
-        }
-        short_pause();
-    }
-    drop((images, scans, world, spectator));
-    let output = run.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", crate::common::text(&output));
-    watched
-}
-
 /// Place of a mount on an upright carrier.
 fn place_m(state: &VehicleState, mount: [f64; 3]) -> [f64; 2] {
     let (sin, cos) = state.yaw_rad.sin_cos();
@@ -151,7 +90,11 @@ fn place_m(state: &VehicleState, mount: [f64; 3]) -> [f64; 2] {
 fn vehicles_and_a_mast_carry_the_sensors_of_their_suites_and_the_same_seed_makes_them_again() {
     let workplace = Workplace::new();
     let config = workplace.write("suites.toml", SUITES);
-    let watched = watch(&workplace, config.to_str().unwrap());
+    let channels = [Channel::World, Channel::Image, Channel::Pointcloud];
+    let arguments = ["simulate", config.to_str().unwrap(), "--set", ONE_TICK_AHEAD];
+    let recording = workplace.record("watched", &arguments, &channels);
+    let world = road_users(&recording);
+    assert_eq!(world.len(), 100);
 
     // The table of `run.json` names what the messages number.
     let text = std::fs::read_to_string(workplace.path().join("runs/watched/run.json")).unwrap();
@@ -183,9 +126,11 @@ fn vehicles_and_a_mast_carry_the_sensors_of_their_suites_and_the_same_seed_makes
         .collect();
     let mast = ROADSIDE_CARRIER;
     let (mut on_vehicles, mut on_mast) = (0, 0);
-    for ((tick, vehicle, number), head) in &watched.images {
-        if *vehicle == mast {
-            assert_eq!((*number, head.id_hash), (3, id_hash("crossing")));
+    for message in of_channel(&recording, Channel::Image) {
+        let layout = ImageLayout::of(&message.header);
+        let head = block::view::<ImageHead>(message.payload(), layout.head).unwrap()[0];
+        if head.vehicle == mast {
+            assert_eq!((head.sensor, head.id_hash), (3, id_hash("crossing")));
             let [x, y, z] = head.position_m;
             assert!((x - 129.0).hypot(y - 126.0) < 1e-9 && (z - 5.5).abs() < 0.5, "{head:?}");
             assert!((head.attitude_rad[2] - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
@@ -196,56 +141,62 @@ fn vehicles_and_a_mast_carry_the_sensors_of_their_suites_and_the_same_seed_makes
             stereo.contains(&head.id_hash) && carriers.contains(&head.id_hash),
             "{head:?}"
         );
-        let (size, mount) = match number {
+        let (size, mount) = match head.sensor {
             1 => ([64, 48], [1.6, 0.3, 1.5]),
             2 => ([32, 24], [1.6, -0.3, 1.5]),
             other => panic!("camera {other} on a vehicle"),
         };
         assert_eq!([head.width, head.height], size);
-        if let Some(states) = watched.world.get(tick) {
-            let state = states.iter().find(|state| state.vehicle == *vehicle).unwrap();
-            let [x, y] = place_m(state, mount);
-            // A lean of a few degrees moves a mount of 1.5 m by some centimetres.
-            assert!((head.position_m[0] - x).hypot(head.position_m[1] - y) < 0.2, "{head:?}");
-            on_vehicles += 1;
-        }
+        let states = &world[&message.header.tick];
+        let state = states.iter().find(|state| state.vehicle == head.vehicle).unwrap();
+        let [x, y] = place_m(state, mount);
+        // A lean of a few degrees moves a mount of 1.5 m by some centimetres.
+        assert!((head.position_m[0] - x).hypot(head.position_m[1] - y) < 0.2, "{head:?}");
+        on_vehicles += 1;
     }
     assert!(
         on_vehicles > 50 && on_mast > 20,
         "{on_vehicles} on vehicles, {on_mast} on the mast"
     );
-    let (mut on_vehicles, mut on_mast) = (0, 0);
-    for ((_, vehicle, number), (scan, objects)) in &watched.scans {
-        assert!(!objects.contains(vehicle), "its own body");
+    let (mut scans, mut on_vehicles, mut on_mast) = (0, 0, 0);
+    for message in of_channel(&recording, Channel::Pointcloud) {
+        scans += 1;
+        let layout = PointcloudLayout::of(&message.header);
+        let scan = block::view::<Scan>(message.payload(), layout.scan).unwrap()[0];
+        let points: &[LidarPoint] = block::view(message.payload(), layout.points).unwrap();
+        let objects: BTreeSet<u32> = points.iter().map(|point| point.object).collect();
+        assert!(!objects.contains(&scan.vehicle), "its own body");
         assert!(
             objects
                 .iter()
                 .all(|object| object & ROADSIDE_CARRIER == 0 || object >> 31 == 1),
             "a mast has no body"
         );
-        match number {
-            3 => on_mast += usize::from(*vehicle == mast),
+        match scan.sensor {
+            3 => on_mast += usize::from(scan.vehicle == mast),
             _ => on_vehicles += usize::from(stereo.contains(&scan.id_hash)),
         }
         assert_eq!(
             scan.range_m.to_bits(),
-            if *number == 2 { 30.0_f32 } else { 100.0 }.to_bits()
+            if scan.sensor == 2 { 30.0_f32 } else { 100.0 }.to_bits()
         );
     }
-    assert_eq!(on_vehicles + on_mast, watched.scans.len());
+    assert_eq!(on_vehicles + on_mast, scans);
     assert!(
         on_vehicles > 50 && on_mast > 20,
         "{on_vehicles} on vehicles, {on_mast} on the mast"
     );
 
-    // The same seed, as fast as it goes: the same images and points, and the configuration that the run wrote gives the same run.
+    // The same seed, with another window: the same images and points, and the configuration that the run wrote gives the same run.
     workplace.succeed(&[
         "simulate",
         "runs/watched/config.toml",
         "--name",
         "again",
         "--set",
-        "run.real_time_factor=0",
+        "run.window_ticks=8",
+        "--set",
+        "record.manner=off",
     ]);
     let [first, second] = ["watched", "again"].map(|name| workplace.report(name));
     for key in ["camera", "lidar", "observation_hash"] {

@@ -2,14 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use crate::common::Workplace;
+use crate::common::{Workplace, of_channel};
 use ipc_schema::{
     block,
     channel::Channel,
     traffic::Kind,
     world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState, WorldLayout},
 };
-use recorder::file::reader::RecordingReader;
 
 type Vector = [f64; 3];
 /// Columns are the body's axes in the world.
@@ -24,17 +23,12 @@ type Moved = (VehicleState, Vec<SubStep>);
 
 /// All ticks of a run on the town from its lossless recording: all road users in the order of their index.
 fn record(workplace: &Workplace, settings: &[&str]) -> Vec<Vec<Moved>> {
-    let mut arguments = vec!["simulate", "--name", "world", "--set", "fanout.enabled=false"];
-    arguments.extend(["--record", "--set", "record.channels=[\"world\"]"]);
+    let mut arguments = vec!["simulate", "--set", "fanout.enabled=false"];
     settings.iter().for_each(|setting| arguments.extend(["--set", setting]));
-    workplace.succeed(&arguments);
-    let recording = RecordingReader::open(&workplace.path().join("runs/world/recording.mcap")).unwrap();
+    let recording = workplace.record("world", &arguments, &[Channel::World]);
     let mut ticks: Vec<Vec<Moved>> = Vec::new();
-    for message in recording.channel_messages().map(Result::unwrap) {
-        assert_eq!(
-            (message.channel, message.header.tick),
-            (Channel::World, ticks.len() as u64)
-        );
+    for message in of_channel(&recording, Channel::World) {
+        assert_eq!(message.header.tick, ticks.len() as u64);
         let layout = WorldLayout::of(&message.header);
         let states: &[VehicleState] = block::view(message.payload(), layout.states).unwrap();
         let rows: &[SubStep] = block::view(message.payload(), layout.sub_steps).unwrap();
