@@ -1,4 +1,4 @@
-"""One rank of a small data-parallel training over prepared ticks; `torchrun` starts it for test_ranks.py."""
+"""One rank of small data-parallel trainings over prepared ticks; `torchrun` starts it for test_ranks.py."""
 
 import json
 import os
@@ -13,15 +13,15 @@ from caraware.run.loop import TrainingLoop
 from synthetic import FIELDS, SyntheticChannel, run_file, with_evaluation
 
 DEVICE = os.environ.get("RANK_PROBE_DEVICE", "cpu")
-SETTINGS = json.loads(os.environ.get("RANK_PROBE_SETTINGS", "{}"))
-"""Of the trainer, beside the sizes below."""
+TRAININGS: dict[str, dict[str, Any]] = json.loads(os.environ.get("RANK_PROBE_TRAININGS", "{}"))
+"""By the name of each training, its settings of the trainer beside the sizes below. A process runs them in turn."""
 HORIZON, BATCH, VEHICLES, TRAINING_TICKS = 256, 64, 16, 64
 
 
-def settings(folder: Path, envs: int, first_env: int, world: int, more: dict[str, Any] | None = None) -> dict[str, Any]:
+def settings(folder: Path, envs: int, first_env: int, world: int, more: dict[str, Any]) -> dict[str, Any]:
     """The run file of one trainer with `envs` environments among `world` ranks; sizes are of each environment."""
     sizes = {"ranks": world, "horizon": envs * HORIZON, "batch_size": envs * BATCH}
-    own = sizes | {"checkpoint_interval": 1, "device": DEVICE} | (SETTINGS if more is None else more)
+    own = sizes | {"checkpoint_interval": 1, "device": DEVICE} | more
     run = run_file(str(folder), **own)
     run["config"]["run"] |= {"envs": envs, "first_env": first_env}
     return run
@@ -35,10 +35,18 @@ def channels(run: dict[str, Any]) -> list[SyntheticChannel]:
 
 
 def main(folder: Path, fault: str) -> None:
-    """Train as rank `RANK` in its own directory. A fault makes one of the ranks fail."""
-    rank, world = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-    run = settings(folder / f"rank{rank}", 1, rank, world)
+    """Train as rank `RANK`. A fault makes one of the ranks fail."""
+    world = int(os.environ["WORLD_SIZE"])
     together = ranks.of_run(world)
+    for name, more in TRAININGS.items():
+        train(folder / name, world, together, more, fault)
+    together.close()
+
+
+def train(folder: Path, world: int, together: ranks.Ranks, more: dict[str, Any], fault: str) -> None:
+    """One training, in the directory of this rank."""
+    rank = int(os.environ["RANK"])
+    run = settings(folder / f"rank{rank}", 1, rank, world, more)
     first, *others = channels(run)
     loop = TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others, ranks=together)
     if rank == 1 and fault == "dies":
@@ -49,7 +57,6 @@ def main(folder: Path, fault: str) -> None:
         loop._start(learner)
         learner.ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
     loop.run()
-    together.close()
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +40,19 @@ LARGEST_DIFFERENCE = 1e-5
 PATIENCE_S = 240
 
 
-@pytest.fixture
-def registry() -> Iterator[Path]:
+@contextmanager
+def empty_registry() -> Iterator[Path]:
     """A registry of runs, short enough for a socket's path, that must be empty in the end."""
     with tempfile.TemporaryDirectory(prefix="caraware") as folder:
         registry = Path(folder) / "r"
         yield registry
         assert not registry.exists(), "something is left of a run"
+
+
+@pytest.fixture
+def registry() -> Iterator[Path]:
+    with empty_registry() as registry:
+        yield registry
 
 
 def start(folder: Path, registry: Path, words: list[str], horizon: int, *more: str) -> subprocess.Popen[str]:
@@ -76,6 +84,33 @@ def resume(folder: Path, registry: Path, named: str, *more: str) -> tuple[int, s
     return process.returncode, said
 
 
+EVERY_UPDATE = ("trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1")
+
+
+@dataclass(frozen=True)
+class WholeRun:
+    """Two ranks, `whole` and `whole-rank1`, that ran undisturbed and kept the checkpoint of every update."""
+
+    folder: Path
+    said: str
+    """Standard output and standard error."""
+
+    def copy_to(self, folder: Path) -> None:
+        """Copies both ranks, for a test that changes them."""
+        for name in ("whole", "whole-rank1"):
+            shutil.copytree(self.folder / name, folder / name)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> WholeRun:
+    folder = tmp_path_factory.mktemp("whole")
+    with empty_registry() as registry:
+        process = two_ranks(folder, registry, "whole", *EVERY_UPDATE)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    return WholeRun(folder, said)
+
+
 def report(run: Path) -> dict[str, Any]:
     written: dict[str, Any] = json.loads((run / "report.json").read_text())
     return written
@@ -99,34 +134,30 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) ->
         time.sleep(0.01)
 
 
-def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registry: Path) -> None:
+def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registry: Path, whole: WholeRun) -> None:
     one = start(tmp_path, registry, [str(caraware_program()), "train", "--envs=2", "--name=one"], 512)
     said, _ = one.communicate(timeout=PATIENCE_S)
     assert one.returncode == 0, said
-    two = two_ranks(tmp_path, registry)
-    said, _ = two.communicate(timeout=PATIENCE_S)
-    assert two.returncode == 0, said
-    alone, ranks = report(tmp_path / "one"), [report(tmp_path / name) for name in ("two", "two-rank1")]
+    alone, ranks = report(tmp_path / "one"), [report(whole.folder / name) for name in ("whole", "whole-rank1")]
     hashes = [environment["observation_hash"] for environment in alone["environments"]]
     assert [rank["observation_hash"] for rank in ranks] == hashes
     assert alone["trainer"]["updates"] == ranks[0]["trainer"]["updates"] > 1
     assert ranks[0]["trainer"]["env_steps_of_all_ranks"] == alone["env_steps"]
-    expected, found = parameters(tmp_path / "one"), parameters(tmp_path / "two")
+    expected, found = parameters(tmp_path / "one"), parameters(whole.folder / "whole")
     differences = {name: ((tensor - found[name]).norm() / tensor.norm()).item() for name, tensor in expected.items()}
     assert max(differences.values()) < LARGEST_DIFFERENCE, differences
     # Only rank 0 shows its progress.
-    assert "run two: results go to" in said
-    assert "two-rank1" not in said
+    assert "run whole: results go to" in whole.said
+    assert "whole-rank1" not in whole.said
 
 
-def test_ranks_continue_from_the_newest_checkpoint_that_all_have(tmp_path: Path, registry: Path) -> None:
-    every_update = ("trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1")
-    whole = two_ranks(tmp_path, registry, "whole", *every_update)
-    said, _ = whole.communicate(timeout=PATIENCE_S)
-    assert whole.returncode == 0, said
+def test_ranks_continue_from_the_newest_checkpoint_that_all_have(
+    tmp_path: Path, registry: Path, whole: WholeRun
+) -> None:
+    whole.copy_to(tmp_path)
     expected = [tensors(tmp_path / name) for name in ("whole", "whole-rank1")]
 
-    cut = two_ranks(tmp_path, registry, "cut", *every_update, "run.real_time_factor=10")
+    cut = two_ranks(tmp_path, registry, "cut", *EVERY_UPDATE, "run.real_time_factor=10")
     checkpoints = tmp_path / "cut-rank1" / "checkpoints"
     wait_until(lambda: (checkpoints / "update-000003").exists(), cut)
     os.kill(cut.pid, signal.SIGINT)
@@ -199,15 +230,11 @@ os.read(0, 16)
 
 
 def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
-    tmp_path: Path, registry: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "refuser.py").write_text(REFUSER)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH")))))
     names = ("handed", "handed-rank1")
-    whole = two_ranks(tmp_path, registry, "whole")
-    said, _ = whole.communicate(timeout=PATIENCE_S)
-    assert whole.returncode == 0, said
-
     handed = two_ranks(tmp_path, registry, "handed", "trainer.checkpoint_interval=1", "run.real_time_factor=2")
     wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
     # A paused run makes no update, after which its trainer could leave.
@@ -230,8 +257,8 @@ def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     said, _ = handed.communicate(timeout=PATIENCE_S)
     assert handed.returncode == 0, said
     for name, undisturbed in zip(names, ("whole", "whole-rank1"), strict=True):
-        assert tensors(tmp_path / name) == tensors(tmp_path / undisturbed)
-        written, expected = report(tmp_path / name), report(tmp_path / undisturbed)
+        assert tensors(tmp_path / name) == tensors(whole.folder / undisturbed)
+        written, expected = report(tmp_path / name), report(whole.folder / undisturbed)
         assert (len(written["handovers"]), written["restarts"]) == (1, 0)
         assert written["observation_hash"] == expected["observation_hash"]
         assert (written["lost_ticks"], written["duplicated_ticks"]) == (0, 0)

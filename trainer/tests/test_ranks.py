@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +37,25 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+TRAININGS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "with memory": {"network": "gru", "hidden": [24, 12], "truncation_ticks": 5},
+    "several actions": {"actions_per_observation": 4, "discount": 0.0},
+    "own network": {"network": "own_residual:Residual", "hidden": [24], "target_kl": 0.02},
+}
+"""Settings of the trainer beside those of the probe, by name."""
+
+
 def launch(
-    folder: Path, *options: str, fault: str = "", more: dict[str, Any] | None = None, secret: str = ""
+    folder: Path, *options: str, fault: str = "", trainings: Sequence[str] = ("default",), secret: str = ""
 ) -> subprocess.Popen[str]:
-    """`torchrun` over the probe with `more` settings of the trainer, started and not waited for."""
+    """`torchrun` over the probe with these trainings, started and not waited for."""
     path = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
+    chosen = {name: TRAININGS[name] for name in trainings}
     torchrun = [sys.executable, "-m", "torch.distributed.run", *options]
     return subprocess.Popen(
         [*torchrun, str(HERE / "rank_probe.py"), str(folder), fault],
-        env=os.environ | {"PYTHONPATH": path, "RANK_PROBE_SETTINGS": json.dumps(more or {}), SECRET: secret},
+        env=os.environ | {"PYTHONPATH": path, "RANK_PROBE_TRAININGS": json.dumps(chosen), SECRET: secret},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -66,9 +77,9 @@ def part(folder: Path) -> dict[str, Any]:
     return written
 
 
-def learn_alone(folder: Path, more: dict[str, Any] | None = None) -> Path:
+def learn_alone(folder: Path, training: str) -> Path:
     """One trainer with both environments, and a horizon and batch of twice the size."""
-    run = settings(folder, 2, 0, 1, more or {})
+    run = settings(folder, 2, 0, 1, TRAININGS[training])
     first, *others = channels(run)
     TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others).run()
     return folder
@@ -77,7 +88,15 @@ def learn_alone(folder: Path, more: dict[str, Any] | None = None) -> Path:
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of one trainer with the default network."""
-    return learn_alone(tmp_path_factory.mktemp("alone"))
+    return learn_alone(tmp_path_factory.mktemp("alone"), "default")
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every training in two ranks, in a directory of its name. One launch runs all: each process imports torch once."""
+    folder = tmp_path_factory.mktemp("together")
+    finish(launch(folder, "--standalone", "--nproc-per-node=2", trainings=list(TRAININGS)))
+    return folder
 
 
 def assert_the_same(alone: Path, rank0: Path) -> None:
@@ -92,50 +111,38 @@ def assert_the_same(alone: Path, rank0: Path) -> None:
     assert [e["samples"] for e in of_two["evaluations"]] == [e["samples"] for e in of_one["evaluations"]]
 
 
-def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alone: Path) -> None:
-    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2"))
-    assert_the_same(alone, tmp_path / "rank0")
+def test_two_ranks_learn_what_one_does_with_twice_the_batch(together: Path, alone: Path) -> None:
+    ranks = together / "default"
+    assert_the_same(alone, ranks / "rank0")
     # Rank 0's checkpoint is that of one trainer with both environments.
-    mine, theirs = (latest_checkpoint(folder / "checkpoints") for folder in (alone, tmp_path / "rank0"))
+    mine, theirs = (latest_checkpoint(folder / "checkpoints") for folder in (alone, ranks / "rank0"))
     assert load_history(theirs).others == load_history(mine).others
     for name, state in load_file(mine / "random.safetensors").items():
         assert torch.equal(state, load_file(theirs / "random.safetensors")[name])
     # Rank 1's has the same parameters, and where its own environment stands.
-    own = latest_checkpoint(tmp_path / "rank1" / "checkpoints")
+    own = latest_checkpoint(ranks / "rank1" / "checkpoints")
     assert read_manifest(own).files["parameters.safetensors"] == read_manifest(theirs).files["parameters.safetensors"]
     assert not load_history(own).others
     assert load_file(own / "random.safetensors").keys() == {"sampling1", "shuffling"}
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"network": "gru", "hidden": [24, 12], "truncation_ticks": 5},
-        {"actions_per_observation": 4, "discount": 0.0},
-    ],
-    ids=["with memory", "several actions"],
-)
-def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dict[str, Any]) -> None:
-    alone = learn_alone(tmp_path / "alone", more)
-    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
-    assert_the_same(alone, tmp_path / "rank0")
-    mine, theirs = (
-        latest_checkpoint(folder / "checkpoints") / "memory.safetensors" for folder in (alone, tmp_path / "rank0")
-    )
-    assert mine.exists() == theirs.exists() == (more.get("network") == "gru")
+@pytest.mark.parametrize("training", ["with memory", "several actions"])
+def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, together: Path, training: str) -> None:
+    alone, rank0 = learn_alone(tmp_path, training), together / training / "rank0"
+    assert_the_same(alone, rank0)
+    mine, theirs = (latest_checkpoint(folder / "checkpoints") / "memory.safetensors" for folder in (alone, rank0))
+    assert mine.exists() == theirs.exists() == (training == "with memory")
     if mine.exists():
-        remembered, together = load_file(mine), load_file(theirs)
-        assert remembered.keys() == together.keys()
+        remembered, shared = load_file(mine), load_file(theirs)
+        assert remembered.keys() == shared.keys()
         for name, tensor in remembered.items():
-            assert torch.allclose(tensor, together[name], atol=1e-4), name
+            assert torch.allclose(tensor, shared[name], atol=1e-4), name
 
 
-def test_ranks_share_a_network_of_the_user_s_own(tmp_path: Path) -> None:
+def test_ranks_share_a_network_of_the_user_s_own(tmp_path: Path, together: Path) -> None:
     """`PlainUpdate` alone against `RankedUpdate` in two ranks; its checkpoints of other ranks have the same rows."""
-    more = {"network": "own_residual:Residual", "hidden": [24], "target_kl": 0.02}
-    alone = learn_alone(tmp_path / "alone", more)
-    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
-    assert_the_same(alone, tmp_path / "rank0")
+    alone = learn_alone(tmp_path, "own network")
+    assert_the_same(alone, together / "own network" / "rank0")
     assert "policy.0.enter.weight" in parameters(alone)
 
 
@@ -144,7 +151,7 @@ def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> 
     nodes = [launch(tmp_path, *meeting, "--local-addr=127.0.0.1", secret="a text of both nodes") for _ in range(2)]
     for node in nodes:
         finish(node)
-    assert_the_same(alone, tmp_path / "rank0")
+    assert_the_same(alone, tmp_path / "default" / "rank0")
 
 
 def test_a_rank_that_does_not_know_the_secret_ends_the_launch() -> None:
