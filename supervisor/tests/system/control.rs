@@ -221,7 +221,14 @@ fn ultrasonic_sensors_are_switched_off_and_the_run_is_made_again() {
 #[test]
 fn pauses_and_steps_leave_no_trace() {
     let workplace = Workplace::new();
-    let learner = ["--set", "trainer.horizon=400", "--set", "trainer.batch_size=200"];
+    let learner = [
+        "--set",
+        "trainer.horizon=400",
+        "--set",
+        "trainer.batch_size=200",
+        "--set",
+        "trainer.hidden=[32, 32]",
+    ];
     workplace.succeed(&arguments("train", "undisturbed", &learner));
     let mut run = Run::start(&workplace, "train", "paused", &learner);
     let paused_at = run.ticks();

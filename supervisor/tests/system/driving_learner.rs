@@ -6,21 +6,22 @@ use crate::common::{Workplace, text, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Two worlds of four heroes each, and an update every 300 samples.
-const SMALL: [&str; 17] = [
+/// Two worlds of four heroes each, and an update every 300 samples, which are 38 ticks.
+const SMALL: [&str; 18] = [
     "run.envs=2",
     "traffic.heroes=4",
     "traffic.others=3",
     "traffic.pedestrians=2",
-    "task.time_limit_s=20",
-    "episode.ticks=220",
+    "task.time_limit_s=10",
+    "episode.ticks=110",
     "episode.training_episodes=6",
     "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=60",
+    "episode.evaluation_ticks=40",
+    "episode.final_evaluations=1",
     "trainer.network=mlp",
     "trainer.hidden=[16]",
-    "trainer.horizon=600",
-    "trainer.batch_size=300",
+    "trainer.horizon=300",
+    "trainer.batch_size=150",
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",
     "observation.fields=driving",
@@ -101,55 +102,38 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     assert!(expected["evaluations"].as_array().unwrap().len() >= 2, "{expected:#}");
     assert!(expected["heroes"]["episodes"].as_u64().unwrap() >= 8, "{expected:#}");
 
-    // The learner, twice, by SIGKILL.
+    // By SIGKILL: each simulator once, the learner alone, and in the end a simulator at the same time as the learner.
     let mut run = start(
         &workplace,
-        &arguments("killed", &["run.real_time_factor=12"]),
+        &arguments("killed", &["run.real_time_factor=6"]),
         "killed.log",
     );
-    for updates in [2, 6] {
-        wait_for_checkpoint(&workplace, "killed", updates, &mut run);
-        let victim = until(&mut run, "a learner", || {
-            processes(&workplace, "killed", "caraware.train").pop()
-        });
-        kill_process(victim, Signal::KILL).unwrap();
-    }
-    let status = run.wait().unwrap();
-    let said = std::fs::read_to_string(workplace.path().join("killed.log")).unwrap();
-    assert!(status.success(), "{status}\n{said}");
-    assert!(said.contains("a successor continues"), "{said}");
-    assert_eq!(outcome(&workplace, "killed"), expected);
-
-    // Each simulator once, and in the end one at the same time as the learner.
-    let mut run = start(
-        &workplace,
-        &arguments("simulated", &["run.real_time_factor=12"]),
-        "simulated.log",
-    );
-    let victims: [(u32, &[&str]); 4] = [
+    let victims: [(u32, &[&str]); 5] = [
         (1, &["/sim-core"]),
+        (2, &["caraware.train"]),
         (3, &["/traffic-bridge"]),
         (5, &["/sensor-daemon"]),
         (7, &["/sim-core", "caraware.train"]),
     ];
     for (updates, words) in victims {
-        wait_for_checkpoint(&workplace, "simulated", updates, &mut run);
+        wait_for_checkpoint(&workplace, "killed", updates, &mut run);
         for word in words {
-            let victim = until(&mut run, "a process", || processes(&workplace, "simulated", word).pop());
+            let victim = until(&mut run, "a process", || processes(&workplace, "killed", word).pop());
             kill_process(victim, Signal::KILL).unwrap();
         }
     }
     let status = run.wait().unwrap();
-    let said = std::fs::read_to_string(workplace.path().join("simulated.log")).unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("killed.log")).unwrap();
     assert!(status.success(), "{status}\n{said}");
+    assert!(said.contains("a successor continues"), "{said}");
     let again = said.matches("the simulation is made again from tick").count();
-    assert_eq!(again, victims.len(), "{said}");
-    assert_eq!(outcome(&workplace, "simulated"), expected);
+    assert_eq!(again, 4, "{said}");
+    assert_eq!(outcome(&workplace, "killed"), expected);
 
     // A planned handover to a successor of the same kind.
     let mut run = start(
         &workplace,
-        &arguments("handed", &["run.real_time_factor=12"]),
+        &arguments("handed", &["run.real_time_factor=6"]),
         "handed.log",
     );
     wait_for_checkpoint(&workplace, "handed", 2, &mut run);
@@ -163,7 +147,7 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     assert_eq!(outcome(&workplace, "handed"), expected);
 
     // Stopped in its second half, then resumed.
-    let mut run = start(&workplace, &arguments("cut", &["run.real_time_factor=12"]), "cut.log");
+    let mut run = start(&workplace, &arguments("cut", &["run.real_time_factor=6"]), "cut.log");
     wait_for_checkpoint(&workplace, "cut", 4, &mut run);
     kill_process(Pid::from_child(&run), Signal::INT).unwrap();
     assert_eq!(run.wait().unwrap().code(), Some(130));
@@ -185,7 +169,7 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     );
 
     // The same with simulators that die.
-    let paced = ["--episodes", "4", "--set", "run.real_time_factor=8"];
+    let paced = ["--episodes", "4", "--set", "run.real_time_factor=4"];
     let mut run = start(
         &workplace,
         &[&["play", "whole", "--name", "replayed"], paced.as_slice()].concat(),

@@ -12,17 +12,20 @@ use rustix::process::{Pid, Signal, kill_process};
 
 const SIMULATORS: [&str; 3] = ["traffic-bridge", "sim-core", "sensor-daemon"];
 
-/// Two environments of a few vehicles, five episodes with an evaluation between.
-const SMALL: [&str; 12] = [
+/// A few vehicles, four episodes with an evaluation between. Small networks, and no estimates that only viewers see.
+const SMALL: [&str; 15] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
-    "episode.ticks=275",
+    "episode.ticks=140",
     "episode.training_episodes=4",
     "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=80",
-    "trainer.horizon=600",
-    "trainer.batch_size=300",
+    "episode.evaluation_ticks=40",
+    "episode.final_evaluations=1",
+    "trainer.horizon=300",
+    "trainer.batch_size=150",
+    "trainer.hidden=[32, 32]",
+    "trainer.estimates=never",
     "trainer.checkpoint_interval=1",
     "trainer.matmul_precision=float32",
     "fanout.enabled=false",
@@ -143,7 +146,7 @@ fn killed_simulators_of_two_environments_change_nothing_that_is_observed_or_lear
     let workplace = Workplace::new();
     let two = "run.envs=2";
     workplace.succeed(&arguments(&["train", "town", "--name", "whole"], &SMALL, &[two]));
-    let paced = "run.real_time_factor=20";
+    let paced = "run.real_time_factor=8";
     let disturbed = arguments(&["train", "town", "--name", "killed"], &SMALL, &[two, paced]);
     killed_run(&workplace, &disturbed, "killed", 8);
     assert_same(&workplace, ["whole", "killed"]);
@@ -159,7 +162,7 @@ fn a_sensor_daemon_that_is_killed_again_while_it_is_made_again_changes_nothing()
     let paced = arguments(
         &["train", "town", "--name", "killed"],
         &SMALL,
-        &[late, "run.real_time_factor=20"],
+        &[late, "run.real_time_factor=10"],
     );
     let log = std::fs::File::create(workplace.path().join("said")).unwrap();
     let command = workplace.command(&paced).stdout(Stdio::null()).stderr(log).spawn();

@@ -14,18 +14,19 @@ use ipc_schema::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Four vehicles, three training episodes, one evaluation in between and one at the end: 800 ticks, 8 updates with two environments.
-const SMALL: [&str; 12] = [
+/// Four vehicles, three training episodes, one evaluation in between and one at the end: 400 ticks, 8 updates with two environments.
+const SMALL: [&str; 13] = [
     "traffic.cavs=4",
     "traffic.others=2",
     "traffic.pedestrians=2",
-    "episode.ticks=200",
+    "episode.ticks=100",
     "episode.training_episodes=3",
     "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=100",
+    "episode.evaluation_ticks=50",
     "episode.final_evaluations=1",
-    "trainer.horizon=512",
-    "trainer.batch_size=256",
+    "trainer.horizon=256",
+    "trainer.batch_size=128",
+    "trainer.hidden=[32, 32]",
     "trainer.checkpoint_interval=2",
     "fanout.enabled=false",
 ];
@@ -136,7 +137,7 @@ fn a_restarted_trainer_receives_the_uncommitted_ticks_of_every_environment() {
     let workplace = Workplace::new();
     succeed(&workplace, "train", "undisturbed", &["--envs", "2"]);
     let mut live = Live::start(&workplace, "train", "killed", &["--envs", "2"]);
-    live.kill(Process::Trainer, 1, 150);
+    live.kill(Process::Trainer, 1, 75);
     let (code, said) = live.end();
     assert_eq!(code, Some(0), "{said}");
     let (expected, found) = (workplace.report("undisturbed"), workplace.report("killed"));
@@ -163,7 +164,9 @@ fn a_restarted_trainer_receives_the_uncommitted_ticks_of_every_environment() {
 fn a_simulator_that_is_killed_is_named_with_its_environment_which_is_made_again() {
     let workplace = Workplace::new();
     succeed(&workplace, "simulate", "whole", &["--envs", "3"]);
-    let mut live = Live::start(&workplace, "simulate", "broken", &["--envs", "3"]);
+    // At this pace the kill has more than a second before the end.
+    let paced = ["--envs", "3", "--set", "run.real_time_factor=20"];
+    let mut live = Live::start(&workplace, "simulate", "broken", &paced);
     live.kill(Process::SimCore, 2, 20);
     let (code, said) = live.end();
     assert_eq!(code, Some(0), "{said}");

@@ -106,6 +106,8 @@ fn training_begins_on_a_scenario_whose_first_ticks_have_no_vehicle() {
         "episode.training_episodes=2",
         "episode.ticks=120",
         "episode.evaluation_ticks=40",
+        "episode.final_evaluations=1",
+        "trainer.hidden=[32, 32]",
         "trainer.horizon=200",
         "trainer.batch_size=100",
         "map.origin_latitude_deg=52",

@@ -7,15 +7,17 @@ use ipc_schema::{process::Process, services::Channel};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-const SMALL: [&str; 9] = [
+const SMALL: [&str; 11] = [
     "traffic.cavs=4",
     "traffic.others=2",
     "traffic.pedestrians=0",
-    "episode.ticks=160",
+    "episode.ticks=80",
     "episode.training_episodes=1",
+    "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
-    "trainer.horizon=300",
-    "trainer.batch_size=150",
+    "trainer.horizon=150",
+    "trainer.batch_size=75",
+    "trainer.hidden=[32, 32]",
     "fanout.enabled=false",
 ];
 
@@ -54,7 +56,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
     );
     assert_eq!(
         (&report["ticks"], &report["evaluation_seeds"]),
-        (&320.into(), &2.into())
+        (&160.into(), &2.into())
     );
     let error_m = |key: &str| report[key].as_f64().unwrap();
     assert!(error_m("ekf_mean_error_m") < error_m("raw_gnss_mean_error_m"));
@@ -126,10 +128,10 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
             "observation.fields",
         ],
     );
-    let hidden = ["play", "learnt", "--set", "trainer.hidden=[32, 32]"];
+    let hidden = ["play", "learnt", "--set", "trainer.hidden=[16]"];
     refused(
         &workplace.run(&hidden),
-        &["hidden layers [500, 300], the configuration's [32, 32]"],
+        &["hidden layers [32, 32], the configuration's [16]"],
     );
     refused(&workplace.run(&["play", "unknown"]), &["`unknown` is neither a run"]);
     let help = text(&workplace.run(&["play", "--help"]));
@@ -145,7 +147,7 @@ fn simulators_that_die_change_nothing_that_a_player_counts() {
     train(&workplace);
     workplace.succeed(&["play", "learnt", "--episodes", "4", "--name", "whole"]);
     let log = std::fs::File::create(workplace.path().join("said")).unwrap();
-    let paced = ["--episodes", "4", "--set", "run.real_time_factor=5"];
+    let paced = ["--episodes", "4", "--set", "run.real_time_factor=2.5"];
     let mut run = workplace
         .command(&[&["play", "learnt", "--name", "killed"], paced.as_slice()].concat())
         .stdout(Stdio::null())
@@ -154,10 +156,10 @@ fn simulators_that_die_change_nothing_that_a_player_counts() {
         .unwrap();
     let spectator = Spectator::join(&workplace.path().join("runs/killed/run.json"), &mut run);
     for (ticks, process) in [
-        (40, Process::SimCore),
-        (180, Process::TrafficBridge),
-        (300, Process::SensorDaemon),
-        (420, Process::SimCore),
+        (20, Process::SimCore),
+        (90, Process::TrafficBridge),
+        (150, Process::SensorDaemon),
+        (210, Process::SimCore),
     ] {
         let (player, victim) = (spectator.board(Process::Trainer), spectator.board(process));
         until(&mut run, "ticks", || {

@@ -3,6 +3,7 @@
 use std::{
     path::{Path, PathBuf},
     process::{Child, Output, Stdio},
+    sync::OnceLock,
 };
 
 use crate::common::{CURRICULUM, Workplace, text, until};
@@ -10,18 +11,21 @@ use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Six vehicles, four training episodes with one evaluation in between: 1 500 ticks of which 400 are evaluations, a checkpoint for every
-/// update.
-const SMALL: [&str; 13] = [
+/// Six vehicles, four training episodes with one evaluation in between: 640 ticks of which 80 are evaluations, a checkpoint for every
+/// update. Small networks, and no estimates that only viewers see.
+const SMALL: [&str; 16] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
-    "episode.ticks=275",
+    "episode.ticks=140",
     "episode.training_episodes=4",
     "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=80",
-    "trainer.horizon=600",
-    "trainer.batch_size=300",
+    "episode.evaluation_ticks=40",
+    "episode.final_evaluations=1",
+    "trainer.horizon=300",
+    "trainer.batch_size=150",
+    "trainer.hidden=[32, 32]",
+    "trainer.estimates=never",
     "trainer.checkpoint_interval=1",
     "trainer.checkpoint_keep_every=1",
     "trainer.matmul_precision=float32",
@@ -38,7 +42,9 @@ fn run_dir(workplace: &Workplace, name: &str) -> PathBuf {
 }
 
 /// The results of a run: the hash of every tensor of the newest checkpoint, every evaluation, and the number of samples.
-fn outcome(workplace: &Workplace, name: &str) -> (String, Vec<(u64, f64, f64)>, Value) {
+type Outcome = (String, Vec<(u64, f64, f64)>, Value);
+
+fn outcome(workplace: &Workplace, name: &str) -> Outcome {
     let report = workplace.report(name);
     assert_eq!(report["result"], "completed");
     assert_eq!(
@@ -60,6 +66,16 @@ fn outcome(workplace: &Workplace, name: &str) -> (String, Vec<(u64, f64, f64)>, 
         evaluations.iter().map(evaluation).collect(),
         serde_json::json!(learnt),
     )
+}
+
+/// The results of a run with the small settings that was never stopped, from the first such run.
+static NEVER_STOPPED: OnceLock<Outcome> = OnceLock::new();
+
+fn never_stopped(workplace: &Workplace) -> &'static Outcome {
+    NEVER_STOPPED.get_or_init(|| {
+        workplace.succeed(&arguments("never-stopped", &[]));
+        outcome(workplace, "never-stopped")
+    })
 }
 
 fn tensors(run: &Path) -> String {
@@ -87,12 +103,13 @@ fn refused(output: &Output, code: i32, words: &[&str]) {
 fn a_resumed_run_ends_with_the_results_of_one_that_was_never_stopped() {
     let workplace = Workplace::new();
     workplace.succeed(&arguments("whole", &[]));
-    let expected = outcome(&workplace, "whole");
+    let expected = NEVER_STOPPED.get_or_init(|| outcome(&workplace, "whole")).clone();
+    assert_eq!(outcome(&workplace, "whole"), expected);
     assert_eq!(expected.1.len(), 2, "an evaluation between and one at the end");
 
     // The run is stopped in its second half. Its newest checkpoint is damaged, so it resumes from the one before.
     let mut run = workplace
-        .command(&arguments("cut", &["run.real_time_factor=40"]))
+        .command(&arguments("cut", &["run.real_time_factor=6"]))
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
@@ -152,7 +169,7 @@ fn a_resumed_run_ends_with_the_results_of_one_that_was_never_stopped() {
     let cavs = ["train", "--resume", "whole", "--set", "traffic.cavs=7"];
     refused(&workplace.run(&cavs), 2, &["`traffic.cavs` cannot change", "trainer."]);
     let wide = ["train", "--resume", "whole", "--set", "trainer.hidden=[64]"];
-    refused(&workplace.run(&wide), 2, &["hidden layers [500, 300]", "[64]"]);
+    refused(&workplace.run(&wide), 2, &["hidden layers [32, 32]", "[64]"]);
     refused(
         &workplace.run(&["train", "--resume", "unknown"]),
         2,
@@ -179,7 +196,7 @@ fn assert_same_end_from_every_checkpoint(workplace: &Workplace, log: &str, kept:
 
 /// Starts `arguments` at a slow pace, stops the run after the checkpoint `kept`, and resumes it in its directory.
 fn stop_and_resume(workplace: &Workplace, name: &str, arguments: &[&str], kept: &str) {
-    let pace = [arguments, &["--set", "run.real_time_factor=40"]].concat();
+    let pace = [arguments, &["--set", "run.real_time_factor=20"]].concat();
     let mut command = workplace.command(&pace);
     let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let checkpoint = run_dir(workplace, name).join("checkpoints").join(kept);
@@ -192,7 +209,7 @@ fn stop_and_resume(workplace: &Workplace, name: &str, arguments: &[&str], kept: 
 #[test]
 fn every_environment_resumes_at_its_own_tick() {
     let workplace = Workplace::new();
-    let two = ["run.envs=2", "trainer.horizon=1200"];
+    let two = ["run.envs=2", "trainer.horizon=600"];
     workplace.succeed(&arguments("whole", &two));
     let expected = outcome(&workplace, "whole");
     stop_and_resume(&workplace, "cut", &arguments("cut", &two), "update-000005");
@@ -238,13 +255,14 @@ fn a_curriculum_resumes_within_its_stages() {
     workplace.assert_nothing_left();
 }
 
-/// Commands in the first episode, which is reset at tick 150, in the episode after it, which is reset at tick 620, and in the one after that.
-const COMMANDS: &str = r#"{"tick":100,"episode":0,"control":{"command":"sensor","vehicle":"cav.1","sensor":"gnss","state":"off"}}
-{"tick":150,"episode":0,"control":{"command":"reset"}}
-{"tick":200,"episode":1,"control":{"command":"destination","vehicle":"cav.1","edge":"ring_west_2"}}
-{"tick":620,"episode":2,"control":{"command":"reset"}}
-{"tick":700,"episode":3,"control":{"command":"sensor","vehicle":null,"sensor":"imu","state":"off"}}
-{"tick":760,"episode":3,"control":{"command":"start","vehicle":"cav.3","edge":"ring_north_1"}}
+/// Commands in the first episode, which is reset at tick 75, in episodes after it, of which one is reset at tick 310, and in the one after
+/// that.
+const COMMANDS: &str = r#"{"tick":50,"episode":0,"control":{"command":"sensor","vehicle":"cav.1","sensor":"gnss","state":"off"}}
+{"tick":75,"episode":0,"control":{"command":"reset"}}
+{"tick":100,"episode":1,"control":{"command":"destination","vehicle":"cav.1","edge":"ring_west_2"}}
+{"tick":310,"episode":2,"control":{"command":"reset"}}
+{"tick":350,"episode":3,"control":{"command":"sensor","vehicle":null,"sensor":"imu","state":"off"}}
+{"tick":380,"episode":3,"control":{"command":"start","vehicle":"cav.3","edge":"ring_north_1"}}
 "#;
 
 #[test]
@@ -262,8 +280,8 @@ fn commands_after_the_checkpoint_are_carried_out_again() {
     workplace.assert_nothing_left();
 }
 
-/// A pace at which the supervisor can be killed at a given tick: 20 s for the run.
-const SLOW: &str = "run.real_time_factor=8";
+/// A pace at which the supervisor can be killed at a given tick: 16 s for the run.
+const SLOW: &str = "run.real_time_factor=4";
 
 /// The supervisor of the run `name` that is none of `before`.
 fn supervisor(workplace: &Workplace, name: &str, run: &mut Child, before: &[Pid]) -> Pid {
@@ -293,12 +311,12 @@ fn until_sensed(workplace: &Workplace, name: &str, run: &mut Child, pid: Pid, ti
 #[test]
 fn a_run_that_is_killed_before_its_first_checkpoint_resumes_from_its_beginning() {
     let workplace = Workplace::new();
-    let late = ["trainer.horizon=2400"];
+    let late = ["trainer.horizon=1200"];
     workplace.succeed(&arguments("whole", &late));
     let expected = outcome(&workplace, "whole");
     let mut command = arguments("cut", &[late[0], SLOW]);
-    // While the processes start, and twice while the first horizon fills, which is 400 ticks long.
-    for ticks in [0, 30, 100] {
+    // While the processes start, and twice while the first horizon fills, which is 200 ticks long.
+    for ticks in [0, 15, 50] {
         let mut spawned = workplace.command(&command);
         let mut run = spawned.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let pid = Pid::from_child(&run);
@@ -330,14 +348,13 @@ fn a_run_that_is_killed_before_its_first_checkpoint_resumes_from_its_beginning()
 #[test]
 fn a_run_with_restart_resumes_by_itself_until_it_is_asked_to_stop() {
     let workplace = Workplace::new();
-    workplace.succeed(&arguments("whole", &[]));
     let command = [&arguments("cut", &[SLOW])[..], &["--restart"]].concat();
     let log = std::fs::File::create(workplace.path().join("said")).unwrap();
     let mut spawned = workplace.command(&command);
     let mut run = spawned.stdout(Stdio::null()).stderr(log).spawn().unwrap();
-    // While the processes start, before the first checkpoint (tick 100), and after it.
+    // While the processes start, before the first checkpoint (tick 50), and after it.
     let mut killed = Vec::new();
-    for ticks in [0, 40, 350] {
+    for ticks in [0, 20, 175] {
         let pid = supervisor(&workplace, "cut", &mut run, &killed);
         if ticks > 0 {
             until_sensed(&workplace, "cut", &mut run, pid, ticks);
@@ -354,7 +371,7 @@ fn a_run_with_restart_resumes_by_itself_until_it_is_asked_to_stop() {
         3,
         "{said}"
     );
-    assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    assert_eq!(outcome(&workplace, "cut"), *never_stopped(&workplace));
     workplace.assert_nothing_left();
 
     // A stop on request is final, and a wrong configuration is no death.

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 const SMALL: [&str; 18] = [
     "traffic.cavs=6",
     "traffic.others=2",
-    "episode.ticks=160",
+    "episode.ticks=110",
     "episode.training_episodes=6",
     "episode.evaluation_interval=3",
     "episode.evaluation_ticks=40",
@@ -102,7 +102,7 @@ fn a_killed_learner_that_sees_and_killed_cameras_change_nothing_that_is_seen_or_
     }
 
     let command = workplace
-        .command(&arguments("killed", &["run.real_time_factor=15"]))
+        .command(&arguments("killed", &["run.real_time_factor=8"]))
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn();
