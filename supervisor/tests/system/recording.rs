@@ -15,8 +15,8 @@ use recorder::file::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-/// A short training run of six vehicles, without viewers.
-const SHORT: [&str; 10] = [
+/// A short training run of six vehicles with small networks, without viewers.
+const SHORT: [&str; 12] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -24,8 +24,10 @@ const SHORT: [&str; 10] = [
     "episode.training_episodes=4",
     "episode.evaluation_interval=2",
     "episode.evaluation_ticks=40",
+    "episode.final_evaluations=2",
     "trainer.horizon=900",
     "trainer.batch_size=300",
+    "trainer.hidden=[32, 32]",
     "fanout.enabled=false",
 ];
 
