@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from recorded_run import ASKEW, RecordedFrame, of_carriers, recorded_run
+from recorded_run import ASKEW, TRAINED, RecordedFrame, of_carriers, recorded_run
 
 BYTECODE = Path(__file__).parents[2] / "target" / "tmp" / "bytecode"
 """Where the tests in Rust keep it, too."""
@@ -32,3 +32,10 @@ def askew_run() -> Iterator[Path]:
 def askew_frames(askew_run: Path) -> dict[tuple[int, int], RecordedFrame]:
     """Its frames by vehicle and tick."""
     return of_carriers(askew_run)
+
+
+@pytest.fixture(scope="session")
+def trained_run() -> Iterator[Path]:
+    """A recorded run of a learner, `a.run_3`, with seed 3."""
+    with recorded_run("train", TRAINED | {"run.seed": 3}, name="a.run_3") as run_dir:
+        yield run_dir

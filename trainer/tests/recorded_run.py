@@ -45,6 +45,24 @@ ASKEW = {
 }
 """Three carriers of a LIDAR, two of them with a camera; both are off-centre and turned, so no symmetry hides a sign."""
 
+TRAINED = {
+    "traffic.cavs": 5,
+    "traffic.others": 3,
+    "traffic.pedestrians": 2,
+    "episode.ticks": 150,
+    "episode.training_episodes": 2,
+    "episode.evaluation_interval": 0,
+    "episode.final_evaluations": 2,
+    "episode.evaluation_ticks": 60,
+    "trainer.horizon": 500,
+    "trainer.batch_size": 250,
+    "fanout.enabled": "false",
+    "record.chunk_mib": 1,
+    "record.channels": '["observation", "prediction", "world", "traffic-meta", "traffic"]',
+}
+"""A short run of two training episodes and two evaluations, with SUMO's own states beside the mirrors'."""
+TRAINED_TICKS = 420
+
 
 @contextmanager
 def recorded_run(

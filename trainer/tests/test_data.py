@@ -8,7 +8,6 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,33 +23,15 @@ from caraware.data import Recording, RecordingError, TickDataset, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.fcd import angle_deg
 from caraware.data.names import RoadUsers
-from recorded_run import assert_has_card, recorded_run, unseen
+from recorded_run import TRAINED_TICKS, assert_has_card, unseen
 from torch.utils.data import DataLoader
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "figure.ipynb"
-SETTINGS = {
-    "traffic.cavs": 5,
-    "traffic.others": 3,
-    "traffic.pedestrians": 2,
-    "episode.ticks": 120,
-    "episode.training_episodes": 2,
-    "episode.evaluation_interval": 0,
-    "episode.final_evaluations": 1,
-    "episode.evaluation_ticks": 60,
-    "trainer.horizon": 500,
-    "trainer.batch_size": 250,
-    "trainer.supervised": "false",
-    "fanout.enabled": "false",
-    "record.chunk_mib": 1,
-    "record.channels": '["observation", "prediction", "world", "traffic-meta", "traffic"]',
-}
-"""A short run of two training episodes and an evaluation, with SUMO's own states beside the mirrors'."""
 
 
 @pytest.fixture(scope="module")
-def run_dir() -> Iterator[Path]:
-    with recorded_run("train", SETTINGS) as run_dir:
-        yield run_dir
+def run_dir(trained_run: Path) -> Path:
+    return trained_run
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +43,11 @@ def test_arrays_are_the_messages_and_lie_in_memory_maps(recording: Recording) ->
     assert recording.damage is None and recording.end is not None
     assert recording.end["missed_ticks"] == 0 and recording.start["is_lossless"]
     messages = list(recording.messages("observation"))
-    assert [message.tick for message in messages] == list(range(300))
-    assert np.array_equal(recording.ticks(), np.arange(300))
+    assert [message.tick for message in messages] == list(range(TRAINED_TICKS))
+    assert np.array_equal(recording.ticks(), np.arange(TRAINED_TICKS))
     truth = recording.rows("observation", "truth")
     assert isinstance(truth, np.memmap) and not truth.flags.writeable
-    for place in (0, 137, 299):
+    for place in (0, 187, 419):
         for name in ("truth", "imu", "gnss_geodetic", "vehicle"):
             expected = messages[place].section(name)
             assert np.array_equal(recording.at("observation", place, name), expected, equal_nan=True), name
@@ -80,9 +61,9 @@ def test_arrays_are_the_messages_and_lie_in_memory_maps(recording: Recording) ->
 
 def test_episodes_and_vehicles_follow_the_truth_without_jumps(recording: Recording) -> None:
     episodes = list(recording.episodes())
-    assert [len(episode) for episode in episodes] == [120, 120, 60]
-    assert [episode.is_evaluation for episode in episodes] == [False, False, True]
-    assert len({episode.seed for episode in episodes}) == 3
+    assert [len(episode) for episode in episodes] == [150, 150, 60, 60]
+    assert [episode.is_evaluation for episode in episodes] == [False, False, True, True]
+    assert len({episode.seed for episode in episodes}) == 4
     users = RoadUsers(recording)
     for episode in episodes:
         tracks = list(episode.vehicles())
@@ -115,8 +96,8 @@ def test_a_data_set_loads_in_batches(recording: Recording) -> None:
 def test_parquet_and_csv_have_the_values_of_the_messages(recording: Recording, run_dir: Path, tmp_path: Path) -> None:
     shown: list[tuple[int, int]] = []
     directory = tmp_path / "parquet"
-    assert export(run_dir, "parquet", directory, 2, lambda done, total: shown.append((done, total))) == 3
-    assert shown[0] == (0, 3) and shown[-1] == (3, 3)
+    assert export(run_dir, "parquet", directory, 1, lambda done, total: shown.append((done, total))) == 4
+    assert shown[0] == (0, 4) and shown[-1] == (4, 4)
     table = pyarrow.dataset.dataset(directory, format="parquet", exclude_invalid_files=True).to_table()
     vehicle = recording.rows("observation", "vehicle")
     assert table.num_rows == int((vehicle != _native.EMPTY_SLOT).sum())
@@ -145,7 +126,7 @@ def test_parquet_and_csv_have_the_values_of_the_messages(recording: Recording, r
     assert (directory / "episode-00000.parquet").stat().st_mtime_ns == kept
     assert_has_card(directory, run_dir)
 
-    assert export(run_dir, "csv", tmp_path / "csv", 1, unseen) == 3
+    assert export(run_dir, "csv", tmp_path / "csv", 1, unseen) == 4
     assert_has_card(tmp_path / "csv", run_dir)
     with (tmp_path / "csv" / "episode-00002.csv").open() as file:
         lines = list(csv.DictReader(file))
@@ -162,11 +143,16 @@ def test_an_interrupted_export_of_two_jobs_continues_as_a_command(run_dir: Path,
     module = [sys.executable, "-m", "caraware.data.export", str(run_dir), "--to", "parquet", "--jobs", "2"]
     ran = subprocess.run([*module, "--output", str(tmp_path)], capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr
-    assert "3 episodes written as Parquet" in ran.stdout
+    assert "4 episodes written as Parquet" in ran.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "README.md",
-        *(f"episode-{number:05}.parquet" for number in range(3)),
+        *(f"episode-{number:05}.parquet" for number in range(4)),
     ]
+    # Two processes write what one writes.
+    assert export(run_dir, "parquet", tmp_path / "alone", 1, unseen) == 4
+    for part in sorted(tmp_path.glob("*.parquet")):
+        alone = pyarrow.parquet.read_table(tmp_path / "alone" / part.name)
+        assert pyarrow.parquet.read_table(part).equals(alone, check_metadata=True)
 
 
 def test_sumo_reads_the_floating_car_data_and_it_lies_on_sumos_own_positions(
@@ -175,10 +161,10 @@ def test_sumo_reads_the_floating_car_data_and_it_lies_on_sumos_own_positions(
     export(run_dir, "fcd", tmp_path, 1, unseen)
     assert_has_card(tmp_path, run_dir)
     parts = sorted(tmp_path.glob("*.fcd.xml"))
-    assert len(parts) == 3
+    assert len(parts) == 4
     attributes = ["id", "x", "y", "angle"]
     steps = list(sumolib.xml.parse_fast_nested(str(parts[0]), "timestep", ["time"], "vehicle", attributes))
-    assert len({step.time for step, _ in steps}) == 120 and len(steps) > 120 * 5
+    assert len({step.time for step, _ in steps}) == 150 and len(steps) > 150 * 5
     users, compared = RoadUsers(recording), 0
     traffic = {message.tick: message.section("states") for message in recording.messages("traffic")}
     world = {message.tick: message.section("states") for message in recording.messages("world")}
@@ -212,7 +198,7 @@ def test_a_damaged_recording_opens_up_to_the_damage(run_dir: Path, tmp_path: Pat
     recording = open_recording(cut)
     assert recording.damage is not None and recording.damage[0] <= len(whole) // 2
     ticks = recording.ticks()
-    assert 0 < len(ticks) < 300 and np.array_equal(ticks, np.arange(len(ticks)))
+    assert 0 < len(ticks) < TRAINED_TICKS and np.array_equal(ticks, np.arange(len(ticks)))
     cut.write_bytes(whole[:20])
     with pytest.raises(RecordingError, match="byte"):
         open_recording(cut)
@@ -230,6 +216,6 @@ def test_the_notebook_makes_its_figure(run_dir: Path, recording: Recording, tmp_
     exec(compile(code, str(NOTEBOOK), "exec"), values)
     assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
     rows, errors_m = values["rows"], values["errors_m"]
-    assert len(rows) > 100 and set(rows["episode"]) == {2}
+    assert len(rows) > 100 and set(rows["episode"]) == {2, 3}
     assert np.allclose(errors_m["policy"], rows["predicted_error_m"], rtol=1e-4)
     assert 3 < errors_m["GNSS"].mean() < 12 and values["summary"].notna().all(axis=None)

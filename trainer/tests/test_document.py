@@ -16,22 +16,7 @@ import pytest
 from caraware.report.document import FinishedRun, differences, seeds_apart
 from caraware.run.checkpoint import load_history
 from PIL import Image
-from recorded_run import CARAWARE, recorded_run
-
-SETTINGS = {
-    "traffic.cavs": 5,
-    "traffic.others": 2,
-    "traffic.pedestrians": 0,
-    "episode.ticks": 150,
-    "episode.training_episodes": 2,
-    "episode.evaluation_interval": 0,
-    "episode.final_evaluations": 2,
-    "episode.evaluation_ticks": 60,
-    "trainer.horizon": 500,
-    "trainer.batch_size": 250,
-    "fanout.enabled": "false",
-    "record.channels": '["observation"]',
-}
+from recorded_run import CARAWARE, TRAINED, recorded_run
 
 
 class Page(HTMLParser):
@@ -58,12 +43,9 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def run_dirs() -> Iterator[list[Path]]:
-    with (
-        recorded_run("train", SETTINGS | {"run.seed": 3}, name="a_run") as first,
-        recorded_run("train", SETTINGS | {"run.seed": 4}, name="other") as second,
-    ):
-        yield [first, second]
+def run_dirs(trained_run: Path) -> Iterator[list[Path]]:
+    with recorded_run("train", TRAINED | {"run.seed": 4}, name="other") as other:
+        yield [trained_run, other]
 
 
 def _report(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -120,7 +102,7 @@ def test_runs_are_compared_by_what_they_differ_in(run_dirs: list[Path]) -> None:
     runs = [FinishedRun(directory) for directory in run_dirs]
     assert differences(runs) == [["run.seed", "3", "4"]]
     ((group, lines),) = seeds_apart(runs)
-    assert [run.name for run in group] == ["a_run", "other"] and len(lines) >= 4
+    assert [run.name for run in group] == ["a.run_3", "other"] and len(lines) >= 4
     # A run with another setting is of no group, and neither is a second one of the same seed.
     runs[1].config["trainer"]["learning_rate"] *= 2
     assert [row[0] for row in differences(runs)] == ["run.seed", "trainer.learning_rate"]

@@ -14,41 +14,36 @@ from caraware.data import Recording, RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.rows import table
 from caraware.data.names import RoadUsers
-from recorded_run import assert_has_card, recorded_run, unseen
+from recorded_run import TRAINED, assert_has_card, recorded_run, unseen
 
-SETTINGS = {
-    "episode.ticks": 150,
-    "episode.training_episodes": 2,
-    "episode.evaluation_interval": 0,
-    "episode.final_evaluations": 1,
-    "episode.evaluation_ticks": 60,
-    "trainer.horizon": 500,
-    "trainer.batch_size": 250,
-    "fanout.enabled": "false",
+NAME = "a_run_3-v0"
+DRIVING = {
+    "traffic.cavs": 0,
+    "traffic.heroes": 4,
+    "traffic.others": 10,
+    "task.time_limit_s": 6,
+    "record.channels": '["observation", "prediction", "world", "traffic-meta"]',
 }
-LOCALISATION = {"traffic.cavs": 5, "traffic.others": 3, "traffic.pedestrians": 2, "trainer.supervised": "false"}
-DRIVING = {"traffic.heroes": 4, "traffic.others": 10, "traffic.pedestrians": 2, "task.time_limit_s": 6}
 
 
 @pytest.fixture(scope="module")
-def localisation() -> Iterator[Path]:
-    with recorded_run("train", SETTINGS | LOCALISATION, name="a.run") as run_dir:
-        yield run_dir
+def localisation(trained_run: Path) -> Path:
+    return trained_run
 
 
 @pytest.fixture(scope="module")
 def driving() -> Iterator[Path]:
-    with recorded_run("train", SETTINGS | DRIVING, preset="driving", name="a.run") as run_dir:
+    with recorded_run("train", TRAINED | DRIVING, preset="driving", name="a.run_3") as run_dir:
         yield run_dir
 
 
-def _load(run_dir: Path, directory: Path, monkeypatch: pytest.MonkeyPatch) -> minari.MinariDataset:
+def _load(run_dir: Path, directory: Path, monkeypatch: pytest.MonkeyPatch, jobs: int = 1) -> minari.MinariDataset:
     """Export a run, and let Minari find the data set by its name."""
-    assert export(run_dir, "minari", directory, 2, unseen) == 3
+    assert export(run_dir, "minari", directory, jobs, unseen) == 4
     assert_has_card(directory, run_dir)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(directory))
-    assert list(minari.list_local_datasets(compatible_minari_version=True)) == ["a_run-v0"]
-    return minari.load_dataset("a_run-v0")
+    assert list(minari.list_local_datasets(compatible_minari_version=True)) == [NAME]
+    return minari.load_dataset(NAME)
 
 
 def _check(dataset: minari.MinariDataset) -> None:
@@ -79,7 +74,7 @@ def _rows(recording: Recording) -> dict[tuple[int, str], dict[str, Any]]:
 def test_every_valid_row_is_one_step_and_minari_loads_them(
     localisation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dataset, recording = _load(localisation, tmp_path, monkeypatch), open_recording(localisation)
+    dataset, recording = _load(localisation, tmp_path, monkeypatch, jobs=2), open_recording(localisation)
     _check(dataset)
     rows, steps = _rows(recording), 0
     messages = {message.tick: message for message in recording.messages("observation")}
@@ -120,7 +115,7 @@ def test_an_export_that_continues_makes_the_same_data_set(
     before = [episode.rewards.sum() for episode in _load(localisation, tmp_path, monkeypatch)]
     (tmp_path / "episode-00001.minari").rename(tmp_path / ".episode-00001.minari.partial")
     assert export(localisation, "minari", tmp_path, 1, unseen) == 1
-    assert [episode.rewards.sum() for episode in minari.load_dataset("a_run-v0")] == before
+    assert [episode.rewards.sum() for episode in minari.load_dataset(NAME)] == before
     assert not list(tmp_path.glob(".*"))
 
 
@@ -147,6 +142,6 @@ def test_heroes_have_the_rewards_and_ends_of_their_task(
 
 
 def test_a_recording_without_predictions_is_refused(tmp_path: Path) -> None:
-    settings = SETTINGS | LOCALISATION | {"record.channels": '["observation"]'}
-    with recorded_run("train", settings) as run_dir, pytest.raises(RecordingError, match="prediction"):
+    # No process of a simulation predicts.
+    with recorded_run("simulate", TRAINED) as run_dir, pytest.raises(RecordingError, match="prediction"):
         export(run_dir, "minari", tmp_path, 1, unseen)
