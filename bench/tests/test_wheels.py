@@ -25,8 +25,8 @@ class Installed:
         self.wheels = directory / "wheels"
         # To compress the programs takes 20 s of a core, and they are unpacked at once.
         stored = {"PIP_CONFIG_SETTINGS": "--build-option=--compression=stored"}
-        wheels = [ROOT / "scripts" / "wheels.sh", sys.executable, self.wheels]
-        subprocess.run(wheels, check=True, cwd=directory, env=os.environ | stored)
+        make_wheels: list[str | Path] = [ROOT / "scripts" / "wheels.sh", sys.executable, self.wheels]
+        subprocess.run(make_wheels, check=True, cwd=directory, env=os.environ | stored)
         self.environment = directory / "environment"
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", self.environment], check=True)
         self.packages = next(self.environment.glob("lib/python3*/site-packages"))
@@ -37,7 +37,7 @@ class Installed:
         (self.packages / "others.pth").write_text(f"{PACKAGES}\n")
         self.work = directory / "work"
         self.work.mkdir()
-        pip = [sys.executable, "-m", "pip", "--python", self.environment]
+        pip: list[str | Path] = [sys.executable, "-m", "pip", "--python", self.environment]
         options = ("--quiet", "--no-index", "--no-deps")
         subprocess.run([*pip, "install", *options, *self.wheels.glob("*.whl")], check=True, cwd=self.work)
 

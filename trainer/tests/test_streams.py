@@ -194,11 +194,12 @@ def test_reruns_importer_has_points_frames_and_images_at_their_times(
             drawn[component] = drawn.get(component, 0) + batch.num_rows
         if "Points3D:positions" in batch.schema.names:
             times = batch.column("message_log_time").cast("int64").to_pylist()
-            positions |= zip(times, batch.column("Points3D:positions").to_pylist(), strict=True)
+            positions |= zip(times, batch.column("Points3D:positions"), strict=True)
     own = {tick: frame for (vehicle, tick), frame in askew_frames.items() if vehicle == 0}
     assert sorted(positions) == [_time_ns(tick, recording) for tick in sorted(own)]
     for tick in list(own)[::20]:
-        assert np.allclose(positions[_time_ns(tick, recording)], own[tick].forward_m, rtol=0, atol=1e-5)
+        found = positions[_time_ns(tick, recording)].as_py()
+        assert np.allclose(found, own[tick].forward_m, rtol=0, atol=1e-5)
     images = sum(frame.image is not None for frame in own.values())
     assert drawn["EncodedImage:blob"] == drawn["Pinhole:image_from_camera"] == images > 20
     assert drawn["Transform3D:translation"] > len(askew_frames)
