@@ -498,7 +498,7 @@ def test_opv2v_has_the_mast_as_a_negative_agent_and_all_lidars_in_one_cloud(
         stamps = sorted(path.stem for path in (scenario / agent).glob("*.yaml"))
         assert [int(stamp) for stamp in stamps] == sorted(t for c, n, t in samples if (c, n) == (carrier, "top"))
         for stamp in stamps[::6]:
-            labels = yaml.safe_load((scenario / agent / f"{stamp}.yaml").read_text())
+            labels = yaml.load((scenario / agent / f"{stamp}.yaml").read_text(), Loader=yaml.CSafeLoader)
             data = (scenario / agent / f"{stamp}.pcd").read_bytes().partition(b"DATA binary\n")[2]
             rows = np.frombuffer(data, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
             points = np.stack([rows[name] for name in "xyz"], 1).astype(np.float64)
