@@ -18,17 +18,21 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Six vehicles, six training episodes with two evaluations in between: 3 000 ticks, 24 updates, a checkpoint for every second update.
-const SMALL: [&str; 12] = [
+/// Six vehicles, six training episodes with two evaluations in between: 1 400 ticks, 24 updates, a checkpoint for every second update.
+/// Small networks, and no estimates that only viewers see.
+const SMALL: [&str; 15] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
-    "episode.ticks=400",
+    "episode.ticks=200",
     "episode.training_episodes=6",
     "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=100",
-    "trainer.horizon=600",
-    "trainer.batch_size=300",
+    "episode.evaluation_ticks=50",
+    "episode.final_evaluations=2",
+    "trainer.horizon=300",
+    "trainer.batch_size=150",
+    "trainer.hidden=[32, 32]",
+    "trainer.estimates=never",
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",
     "fanout.enabled=false",
@@ -211,16 +215,17 @@ fn assert_undisturbed(workplace: &Workplace, name: &str, restarts: u64) {
 #[test]
 fn a_trainer_that_is_killed_again_and_again_learns_the_same_policy() {
     let workplace = Workplace::new();
-    let mut run = Run::start(&workplace, "killed", &[]);
-    // Before the first checkpoint (tick 200), in the middle, in the first evaluation (ticks 800 to 899), after it, in the last.
-    for (incarnation, tick) in [(0, 30), (1, 150), (2, 470), (3, 850), (4, 1234), (5, 2950)] {
+    // At this pace the last kill has half a second before the end.
+    let mut run = Run::start(&workplace, "killed", &["run.real_time_factor=20"]);
+    // Before the first checkpoint (tick 100), in the middle, in the first evaluation (ticks 400 to 449), after it, in the last.
+    for (incarnation, tick) in [(0, 15), (1, 75), (2, 235), (3, 410), (4, 617), (5, 1305)] {
         run.kill_trainer_at(incarnation, tick);
     }
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
     assert_undisturbed(&workplace, "killed", 6);
     let redelivered = workplace.report("killed")["redelivered_ticks"].as_u64().unwrap();
-    assert!(redelivered > 0 && redelivered < 3000, "{redelivered} ticks sent again");
+    assert!(redelivered > 0 && redelivered < 1400, "{redelivered} ticks sent again");
     assert_nothing_left(&workplace, "killed");
 }
 
@@ -268,7 +273,7 @@ fn a_damaged_newest_checkpoint_is_skipped() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "damaged", &[]);
     let pid = {
-        run.until("the fourth checkpoint", |progress, _| progress.committed_ticks >= 800);
+        run.until("the fourth checkpoint", |progress, _| progress.committed_ticks >= 400);
         Pid::from_raw(run.trainer.health().pid).unwrap()
     };
     // A stopped process cannot write another checkpoint while this one is damaged.
@@ -332,11 +337,11 @@ fn a_journal_that_is_too_small_names_its_key() {
         &[
             "run.journal_mib=1",
             "trainer.checkpoint_interval=1000",
-            "episode.ticks=4000",
+            "episode.ticks=800",
         ],
     );
     // A tick is about 1.3 kB: a mebibyte holds some 800 of them.
-    run.kill_trainer_at(0, 2500);
+    run.kill_trainer_at(0, 1600);
     let (code, said) = run.end();
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("`run.journal_mib` (now 1)"), "{said}");
@@ -357,16 +362,17 @@ fn longest_pause(sensing: &BoardReader, mut over: impl FnMut() -> bool) -> Durat
     longest
 }
 
-/// A pace at which a successor gets ready during the run: 15 times real time, 20 s.
-const PACED: &str = "run.real_time_factor=15";
-/// A pace at which two do, one after the other, also beside other work: 6 times real time, 50 s.
-const SLOW: &str = "run.real_time_factor=6";
-const SLOW_TICKS_PER_S: f64 = 60.0;
+/// A pace at which a successor gets ready during the run: 7 times real time, 20 s.
+const PACED: &str = "run.real_time_factor=7";
+/// A pace at which two do, one after the other, also beside other work: 2.8 times real time, 50 s.
+const SLOW: &str = "run.real_time_factor=2.8";
+const SLOW_TICKS_PER_S: f64 = 28.0;
 
 #[test]
 fn a_planned_handover_changes_nothing_but_the_process() {
     let workplace = Workplace::new();
-    let mut run = Run::start(&workplace, "replaced", &[SLOW]);
+    // With the estimates that viewers of a paced run see.
+    let mut run = Run::start(&workplace, "replaced", &[SLOW, "trainer.estimates=paced"]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let old = run.trainer.health().pid;
     let mut handover = workplace
@@ -411,8 +417,8 @@ fn the_learned_estimator_is_handed_over_and_ends_in_the_same_parameters() {
         let sizes = [
             "episode.final_evaluations=1",
             "trainer.checkpoint_interval=1",
-            "fusion.segment_ticks=100",
-            "fusion.truncation_ticks=50",
+            "fusion.segment_ticks=50",
+            "fusion.truncation_ticks=25",
         ];
         arguments_of("fusion", name, &[&sizes[..], more].concat())
     };
@@ -753,7 +759,7 @@ fn an_impossible_handover_is_refused_and_the_old_trainer_continues() {
     let workplace = Workplace::new();
     let short = [
         "observation.fields=caraware",
-        "episode.ticks=120",
+        "episode.ticks=60",
         "episode.training_episodes=1",
     ];
     let wider = arguments("wider", &[&short[..], &["episode.final_evaluations=1"]].concat());
