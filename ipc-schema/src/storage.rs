@@ -97,6 +97,9 @@ pub(crate) fn retry_on_full_disk<T, E: Debug>(
         let result = attempt();
         let is_for_space = |error: &E| format!("{error:?}") != "DoesNotExist" && !(had_space && has_space());
         if !result.as_ref().is_err_and(is_for_space) || is_stopped() {
+            if has_waited && result.is_ok() {
+                tracing::warn!("there is space again: shared memory is opened");
+            }
             return result;
         }
         if !has_waited {
