@@ -338,30 +338,46 @@ def stream(first: int, death: int | None = None) -> Iterator[SyntheticObservatio
             yield replace(obs, episode=episode, evaluation=evaluation, truncated=truncated, last=obs.tick == 139)
 
 
+def stream_settings(folder: Path, discount: float) -> dict[str, Any]:
+    """An update every 16 training ticks, a checkpoint with every second."""
+    return run_file(str(folder), discount=discount, checkpoint_interval=2)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
+    """Directories of undisturbed runs, by their discount."""
+    folders = {discount: tmp_path_factory.mktemp("whole") for discount in (0.0, 0.9)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingLoop, "_draw", lambda loop: None)
+        for discount, folder in folders.items():
+            loop_over(folder, stream(0), group=1, run=stream_settings(folder, discount))
+    return folders
+
+
 @pytest.mark.parametrize("discount", [0.0, 0.9])
 @pytest.mark.parametrize("tick", [2, 11, 30, 36, 60, 99, 110, 125])
 @pytest.mark.parametrize("end", ["left", "killed"])
 def test_a_successor_ends_where_the_undisturbed_run_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, tick: int, discount: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    undisturbed: dict[float, Path],
+    end: str,
+    tick: int,
+    discount: float,
 ) -> None:
-    """An update every 16 training ticks, a checkpoint with every second."""
     monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
-
-    def settings(folder: str) -> dict[str, Any]:
-        return run_file(str(tmp_path / folder), discount=discount, checkpoint_interval=2)
-
-    loop_over(tmp_path / "whole", stream(0), group=1, run=settings("whole"))
-    config = RunConfig.from_run(settings("cut"))
-    first = SyntheticChannel(settings("cut"), stream(0, tick if end == "killed" else None), 1)
+    whole, settings = undisturbed[discount], stream_settings(tmp_path, discount)
+    config = RunConfig.from_run(settings)
+    first = SyntheticChannel(settings, stream(0, tick if end == "killed" else None), 1)
     loop = TrainingLoop(
         first, config, lambda: False, leave_requested=lambda: end == "left" and first.consumed_up_to >= tick
     )
     with contextlib.suppress(KilledError):
         assert not loop.run()
-    newest = newest_sound_checkpoint(tmp_path / "cut" / "checkpoints")
+    newest = newest_sound_checkpoint(tmp_path / "checkpoints")
     learner = Learner.begin(replace(config, resume_from=newest), 4)
-    second = SyntheticChannel(settings("cut"), stream(learner.first_tick()), 1)
+    second = SyntheticChannel(settings, stream(learner.first_tick()), 1)
     assert TrainingLoop(second, config, lambda: False, learner=learner).run()
-    one, two = final_parameters(tmp_path / "whole"), final_parameters(tmp_path / "cut")
+    one, two = final_parameters(whole), final_parameters(tmp_path)
     assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
-    assert part(tmp_path / "cut") == part(tmp_path / "whole")
+    assert part(tmp_path) == part(whole)

@@ -214,35 +214,45 @@ def stream(first: int, death: int | None = None) -> Iterator[SeeingObservation]:
             yield showing(tick)
 
 
+def stream_settings(folder: Path) -> dict[str, Any]:
+    """An update every 16 training ticks, in the middle of trajectories; a checkpoint with every second."""
+    small = {"horizon": 256, "batch_size": 128, "checkpoint_interval": 2, "epochs": 2}
+    return seeing_run(str(folder), **TOY | small)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingLoop, "_draw", lambda loop: None)
+        loop_over(folder, stream(0), group=1, run=stream_settings(folder))
+    return folder
+
+
 @pytest.mark.parametrize(("end", "tick"), [("killed", 36), ("killed", 60), ("killed", 99), ("left", 36), ("left", 60)])
 def test_a_successor_ends_where_the_undisturbed_run_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, tick: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: Path, end: str, tick: int
 ) -> None:
-    """An update every 16 training ticks, in the middle of trajectories; a checkpoint with every second."""
     monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
-
-    def settings(folder: str) -> dict[str, Any]:
-        small = {"horizon": 256, "batch_size": 128, "checkpoint_interval": 2, "epochs": 2}
-        return seeing_run(str(tmp_path / folder), **TOY | small)
-
-    loop_over(tmp_path / "whole", stream(0), group=1, run=settings("whole"))
-    config = RunConfig.from_run(settings("cut"))
-    first = SyntheticChannel(settings("cut"), stream(0, tick if end == "killed" else None), 1)
+    settings = stream_settings(tmp_path)
+    config = RunConfig.from_run(settings)
+    first = SyntheticChannel(settings, stream(0, tick if end == "killed" else None), 1)
     loop = TrainingLoop(
         first, config, lambda: False, leave_requested=lambda: end == "left" and first.consumed_up_to >= tick
     )
     with contextlib.suppress(KilledError):
         assert not loop.run()
-    newest = newest_sound_checkpoint(tmp_path / "cut" / "checkpoints")
+    newest = newest_sound_checkpoint(tmp_path / "checkpoints")
     learner = Learner.begin(replace(config, resume_from=newest), FIELDS)
     assert isinstance(learner.ppo, SeeingPpo)
     if newest is not None:
         assert learner.ppo.recent[0].depth.tolist() == [FRAMES - 1] * 16
-    second = SyntheticChannel(settings("cut"), stream(learner.first_tick()), 1)
+    second = SyntheticChannel(settings, stream(learner.first_tick()), 1)
     assert TrainingLoop(second, config, lambda: False, learner=learner).run()
-    one, two = final_parameters(tmp_path / "whole"), final_parameters(tmp_path / "cut")
+    one, two = final_parameters(undisturbed), final_parameters(tmp_path)
     assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
-    assert part(tmp_path / "cut") == part(tmp_path / "whole")
+    assert part(tmp_path) == part(undisturbed)
 
 
 def test_what_does_not_see_is_refused() -> None:
