@@ -257,7 +257,7 @@ impl RunOnFullDisk {
             if is_busy || ticks.abs_diff(since.1) > 10 {
                 since = (Instant::now(), ticks);
             }
-            std::thread::sleep(Duration::from_millis(20));
+            std::thread::park_timeout(Duration::from_millis(20));
             (since.0.elapsed() > Duration::from_secs(2)).then_some(())
         });
     }
