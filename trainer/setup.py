@@ -10,7 +10,6 @@ third-party crates again. `CARAWARE_BUILT=1` takes what is compiled already (`ma
 import importlib.util
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -49,10 +48,12 @@ def copy_stripped(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copy2(source, target)
     subprocess.run(["strip", target], check=True)
-    content = target.read_bytes()
+    content = bytearray(target.read_bytes())
     # The search path is shortened within its place in the file.
-    pattern = rb"[^\0]*:" + re.escape(SUMO_BESIDE) + rb"\0"
-    content = re.sub(pattern, lambda match: (SUMO_BESIDE + b"\0").ljust(len(match[0]), b"\0"), content)
+    ending = b":" + SUMO_BESIDE + b"\0"
+    while (position := content.find(ending)) >= 0:
+        begin, end = content.rfind(b"\0", 0, position) + 1, position + len(ending)
+        content[begin:end] = ending[1:].ljust(end - begin, b"\0")
     target.write_bytes(content)
 
 
