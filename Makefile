@@ -102,6 +102,12 @@ install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/
 	$(PYTHON) -m venv $(PREFIX)
 	$(call PINS,$(PREFIX),'trainer[$(EXTRAS)]' viewer)
 	$(PREFIX)/bin/pip install --disable-pip-version-check --quiet --no-deps --force-reinstall target/wheels/*.whl
+	$(COMPILE_IMPORTED)
+
+# Compiles the modules of PREFIX that a run imports. Later users, and a container's, may not write beside them: each start of a trainer
+# would compile them again, which takes 3 s of processor time.
+COMPILE_IMPORTED = env -u PYTHONDONTWRITEBYTECODE -u PYTHONPYCACHEPREFIX $(PREFIX)/bin/python -c 'import torch._dynamo, \
+	caraware.train, caraware.play, caraware.run.loop, caraware.ipc.channel, caraware.fusion.train, caraware.report.plots, caraware_viewer.__main__'
 
 image: ## a container image of Containerfile, by podman, buildah or docker
 	scripts/image.sh caraware GPU=$(GPU)
