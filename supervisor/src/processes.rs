@@ -55,6 +55,8 @@ pub struct RunProcesses {
     cores: Option<cores::CorePlan>,
     install: Install,
     restarts: u32,
+    /// Completed handovers of the trainer, without those that fell back.
+    handovers: u32,
     /// Incarnations of processes that are to be started again, by process and environment.
     incarnations: BTreeMap<(Process, u32), u32>,
 }
@@ -77,6 +79,7 @@ impl RunProcesses {
             cores: cores::plan(&cores::available(), envs as usize, run.mode.has_trainer()),
             install,
             restarts: 0,
+            handovers: 0,
             incarnations: BTreeMap::new(),
         })
     }
@@ -195,7 +198,8 @@ impl RunProcesses {
     fn start(&self, row: &'static ProcessSpec, env_index: u32, incarnation: u32) -> Result<RunningProcess, Exit> {
         let environment = &self.environments[env_index as usize];
         cores::within(self.cores_of(row, env_index), || {
-            RunningProcess::start(row, &self.install, &environment.run, &environment.run_file, incarnation)
+            let (run, run_file) = (&environment.run, &environment.run_file);
+            RunningProcess::start(row, &self.install, run, run_file, incarnation, self.handovers)
         })
     }
 
@@ -213,20 +217,23 @@ impl RunProcesses {
         let trainer = trainer.ok_or_else(|| Exit::run("the run has no trainer", ""))?;
         let (row, incarnation) = (trainer.row, trainer.incarnation + 1);
         cores::within(self.cores_of(row, 0), || {
-            RunningProcess::start_successor(row, &self.install, run, run_file, incarnation, request)
+            let handovers = self.handovers + 1;
+            RunningProcess::start_successor(row, &self.install, run, run_file, incarnation, handovers, request)
         })
     }
 
     /// Puts a successor in the place of the process `index`, and starts its work. `run` replaces the run of environment 0.
     pub fn install_successor(&mut self, index: usize, mut successor: RunningProcess, run: RunFile) {
         self.environments[0].run = run;
+        self.handovers += 1;
         successor.begin_work();
         self.running[index] = successor;
     }
 
-    /// Lets `run` be the run of environment 0: restarts of the trainer read it.
-    pub fn set_run(&mut self, run: RunFile) {
+    /// Lets `run`, as it was before the last handover, be the run of environment 0: restarts of the trainer read it.
+    pub fn return_to(&mut self, run: RunFile) {
         self.environments[0].run = run;
+        self.handovers = self.handovers.saturating_sub(1);
     }
 
     /// The oldest tick that the journal of environment 0 holds.
@@ -255,7 +262,11 @@ impl RunProcesses {
             row,
             status,
             is_done: environment.state_of(row.process) == State::Done,
-            on_exit: row.on_exit(self.run()),
+            on_exit: match row.on_exit {
+                // Also where it learns together with other ranks: their trainers follow (decision 51).
+                OnExit::Replace => OnExit::Replace,
+                _ => row.on_exit(self.run()),
+            },
             env_index: self.running[index].env_index,
         })
     }

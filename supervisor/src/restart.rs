@@ -18,6 +18,8 @@ const MAX_VAIN_STARTS: u32 = 20;
 pub const MAX_VAIN_FAULTS: u32 = 5;
 /// Signals that come from outside.
 const KILLS: [i32; 5] = [SIGKILL, SIGTERM, SIGINT, SIGHUP, SIGUSR1];
+/// Exit code of a trainer that ends because that of another rank was replaced, `caraware.learn.meeting.LOST_ANOTHER`.
+const LOST_ANOTHER: i32 = 75;
 /// Pause after the first start in vain. It doubles with each further one.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause.
@@ -66,7 +68,7 @@ impl WatcherRestarts {
 /// Whose fault the end of a process is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EndCause {
-    /// Another process, or a user, has killed it.
+    /// Another process, or a user, has killed it, or the trainer of another rank.
     Kill,
     /// The program itself: a crash, or an exit before its work was done.
     OwnFault,
@@ -78,9 +80,16 @@ impl EndCause {
     pub fn of(status: ExitStatus) -> Self {
         match status.signal() {
             Some(signal) if KILLS.contains(&signal) => Self::Kill,
+            None if lost_another(status) => Self::Kill,
             _ => Self::OwnFault,
         }
     }
+}
+
+/// True if a trainer with this status has ended because that of another rank was replaced.
+#[must_use]
+pub fn lost_another(status: ExitStatus) -> bool {
+    status.code() == Some(LOST_ANOTHER)
 }
 
 /// Restarts of a process, or of the processes of an environment, that the run needs. After a kill it is started again however often
@@ -218,7 +227,14 @@ mod tests {
                 .iter()
                 .all(|cause| *cause == EndCause::Kill)
         );
-        let crashes = [signal_hook::consts::SIGSEGV, signal_hook::consts::SIGABRT, 1 << 8, 0];
+        assert_eq!(cause(LOST_ANOTHER << 8), EndCause::Kill);
+        let crashes = [
+            signal_hook::consts::SIGSEGV,
+            signal_hook::consts::SIGABRT,
+            1 << 8,
+            76 << 8,
+            0,
+        ];
         assert!(crashes.map(cause).iter().all(|cause| *cause == EndCause::OwnFault));
     }
 

@@ -23,6 +23,9 @@ use crate::{failure::Exit, install::Install, socket::HandoverRequest};
 /// blocks of that size in its heaps, one for each thread of zenoh, where they leave holes: memory grew by megabytes an hour.
 const FANOUT_ALLOCATOR: [(&str, &str); 2] = [("MALLOC_MMAP_THRESHOLD_", "65536"), ("MALLOC_ARENA_MAX", "2")];
 
+/// Environment variable: completed handovers of the run, without those that fell back. Trainers that learn together compare it.
+const HANDOVERS: &str = "CARAWARE_HANDOVERS";
+
 /// The command that starts the process of a row.
 ///
 /// # Errors
@@ -79,7 +82,7 @@ pub struct RunningProcess {
 }
 
 impl RunningProcess {
-    /// Starts a row in its own process group. Its output goes to `logs/<process>.log`.
+    /// Starts a row in its own process group, after so many completed handovers of the trainer. Its output goes to `logs/<process>.log`.
     ///
     /// # Errors
     /// The program is missing or cannot be started.
@@ -89,12 +92,16 @@ impl RunningProcess {
         run: &RunFile,
         run_file: &Path,
         incarnation: u32,
+        handovers: u32,
     ) -> Result<Self, Exit> {
-        Self::spawn(row, install, run, run_file, incarnation, |_| {})
+        Self::spawn(row, install, run, run_file, incarnation, |command| {
+            command.env(HANDOVERS, handovers.to_string());
+        })
     }
 
     /// Starts a successor beside the working process of `row`. It reports on the returned standard output that it is ready, and waits
-    /// for [`RunningProcess::begin_work`]. `request` says from which checkpoint it loads its parameters, and where it meets other ranks.
+    /// for [`RunningProcess::begin_work`]. `request` says from which checkpoint it loads its parameters, `handovers` how many the run has
+    /// had when it works.
     ///
     /// # Errors
     /// As [`RunningProcess::start`].
@@ -104,13 +111,14 @@ impl RunningProcess {
         run: &RunFile,
         run_file: &Path,
         incarnation: u32,
+        handovers: u32,
         request: &HandoverRequest,
     ) -> Result<(Self, Option<ChildStdout>), Exit> {
         let mut successor = Self::spawn(row, install, run, run_file, incarnation, |command| {
             command
                 .env("CARAWARE_SUCCESSOR", "1")
                 .envs(request.checkpoint.iter().map(|path| ("CARAWARE_CHECKPOINT", path)))
-                .envs(request.meeting.iter().map(|meeting| ("CARAWARE_MEETING", meeting)))
+                .env(HANDOVERS, handovers.to_string())
                 .stdin(Stdio::piped())
                 .stdout(Stdio::piped());
         })?;

@@ -55,10 +55,10 @@ pub struct HandoverRequest {
     /// Longest time to the old trainer's end, seconds; then the handover is refused.
     #[serde(default)]
     pub timeout_s: Option<f64>,
-    /// Where the successors of trainers that learn together meet. Each answers [`HandoverAnswer::Ready`] first, and its old trainer is not
-    /// asked to leave before the client permits it.
+    /// True if the trainer learns together with others, which are replaced with it. Each supervisor answers [`HandoverAnswer::Ready`]
+    /// first, and its old trainer is not asked to leave before the client permits it.
     #[serde(default)]
-    pub meeting: Option<String>,
+    pub together: bool,
 }
 
 /// The supervisor's answer to a [`HandoverRequest`].

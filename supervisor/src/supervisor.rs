@@ -32,7 +32,7 @@ use crate::{
     memory_limit::MemoryGroups,
     processes::{EndedProcess, RunProcesses},
     registry::RunClaim,
-    restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts},
+    restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts, lost_another},
     socket::{self, HandoverReport, ReceivedRequest},
     stall::{ProcessPlace, READY_WITHIN, StallChange, StallWatch},
     status::last_work,
@@ -267,7 +267,9 @@ impl Supervisor {
                 continue;
             }
             // A simulator that ends by itself was asked to, by a signal that was not the run's.
-            let was_killed = ended.status.signal().is_some() || ended.row.is_simulator() && ended.status.success();
+            let was_killed = ended.status.signal().is_some()
+                || ended.row.is_simulator() && ended.status.success()
+                || ended.row.process == Process::Trainer && lost_another(ended.status);
             let has_reported = self.processes.has_reported_failure(index);
             let left = self.handovers.is_trainer_leaving() && ended.status.success();
             match ended.on_exit {
@@ -332,7 +334,11 @@ impl Supervisor {
             false => format!("{label} has made no progress for {:.0} s", silence.as_secs_f64()),
         };
         let run = self.processes.run();
-        let may_replace = row.on_exit(run) != OnExit::Required || self.may_simulate_again(row);
+        // A trainer that waits for a hung one of another rank gives no sign of life either.
+        let may_replace = match row.on_exit {
+            OnExit::Replace => run.config.trainer.ranks == 1,
+            _ => row.on_exit(run) != OnExit::Required || self.may_simulate_again(row),
+        };
         let is_killed = is_starting || may_replace && run.config.run.on_stall == StallAction::Replace;
         let end = if is_killed { "; it is killed" } else { "" };
         let note = format!("{what}: {state}{end}");

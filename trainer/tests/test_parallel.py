@@ -189,16 +189,68 @@ def test_ranks_continue_from_the_newest_checkpoint_that_all_have(
     assert "no checkpoint here that all 2 ranks have" in said
 
 
-def test_a_killed_trainer_ends_all_ranks(tmp_path: Path, registry: Path) -> None:
-    two = two_ranks(tmp_path, registry)
-    log = tmp_path / "two-rank1" / "logs" / "trainer.log"
+DIES_AT_THE_END = """
+import os, signal, sys
+from caraware.learn.ranks import TorchRanks
+from caraware.train import main
+
+note_end = TorchRanks.note_end
+def die_after_noting(ranks):
+    note_end(ranks)
+    if ranks.rank == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+TorchRanks.note_end = die_after_noting
+sys.exit(main(sys.argv[1:]))
+"""
+"""A trainer whose rank 1 dies when all results are written, before it says that it is done."""
+
+
+def trainer_of(run: Path, module: str) -> int | None:
+    """Process id of the trainer of a run."""
+    run_file = str(run / "run.json")
+    return next((pid for pid, line in command_lines() if run_file in line and module in line), None)
+
+
+def kill_trainer(run: Path, module: str, process: subprocess.Popen[str]) -> None:
+    wait_until(lambda: trainer_of(run, module) is not None, process)
+    pid = trainer_of(run, module)
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+
+
+def assert_undisturbed(runs: Path, names: tuple[str, str], whole: WholeRun) -> None:
+    """Both ranks have learnt and observed what those of the undisturbed launch have, and nothing twice."""
+    for name, undisturbed in zip(names, ("whole", "whole-rank1"), strict=True):
+        assert tensors(runs / name) == tensors(whole.folder / undisturbed)
+        written, expected = report(runs / name), report(whole.folder / undisturbed)
+        assert (written["result"], written["lost_ticks"], written["duplicated_ticks"]) == ("completed", 0, 0)
+        assert written["observation_hash"] == expected["observation_hash"]
+        assert written["trainer"]["updates"] == expected["trainer"]["updates"]
+
+
+def test_a_killed_trainer_comes_back_and_the_ranks_end_as_if_it_had_lived(
+    tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_modules(tmp_path, monkeypatch, dies_at_the_end=DIES_AT_THE_END)
+    names, module = ("two", "two-rank1"), "dies_at_the_end"
+    settings = (*EVERY_UPDATE, "run.real_time_factor=5", f"trainer.module={module}")
+    two = two_ranks(tmp_path, registry, "two", *settings)
+    runs = [tmp_path / name for name in names]
+    # Before the first update, from which nothing could be continued.
+    log = runs[1] / "logs" / "trainer.log"
     wait_until(lambda: log.is_file() and "observations of" in log.read_text(), two)
-    run_file = str(tmp_path / "two-rank1" / "run.json")
-    [trainer] = [pid for pid, line in command_lines() if run_file in line and "caraware.train" in line]
-    os.kill(trainer, signal.SIGKILL)
+    kill_trainer(runs[1], module, two)
+    # Later rank 0, which had come back because of the other.
+    wait_until(lambda: (runs[1] / "checkpoints" / "update-000002").exists(), two)
+    kill_trainer(runs[0], module, two)
     said, _ = two.communicate(timeout=PATIENCE_S)
-    assert two.returncode != 0
-    assert "trainer ended with signal: 9" in said, said
+    assert two.returncode == 0, said
+    assert_undisturbed(tmp_path, names, whole)
+    logs = [(run / "logs" / "trainer.log").read_text() for run in runs]
+    assert all("the trainer of another rank has been replaced" in text for text in logs)
+    # Of rank 1 a third one died, when the others had nothing left to do.
+    assert [report(run)["restarts"] for run in runs] == [2, 3]
+    assert "all ranks had written their results before this trainer came" in logs[1]
     assert not [line for _, line in command_lines() if str(tmp_path) in line]
 
 
@@ -229,11 +281,34 @@ os.read(0, 16)
 """A trainer whose rank 1 does not get ready."""
 
 
+SUCCESSOR = """
+import os, signal, sys
+if os.environ.pop("CARAWARE_SUCCESSOR", ""):
+    os.write(1, b"ready\\n")
+    os.dup2(2, 1)
+    if os.read(0, 16) != b"go\\n":
+        sys.exit(0)
+    if "rank1" in sys.argv[1]:
+        DIES
+from caraware.train import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""A trainer whose rank 1 dies when the old trainers have left."""
+KILLED_ONCE = SUCCESSOR.replace("DIES", "os.kill(os.getpid(), signal.SIGKILL)")
+GIVES_UP = SUCCESSOR.replace("DIES", "sys.exit(5)")
+
+
+def find_modules(folder: Path, monkeypatch: pytest.MonkeyPatch, **modules: str) -> None:
+    """Lets trainers import `modules`, whose sources are given by name."""
+    for name, source in modules.items():
+        (folder / f"{name}.py").write_text(source)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH")))))
+
+
 def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "refuser.py").write_text(REFUSER)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH")))))
+    find_modules(tmp_path, monkeypatch, refuser=REFUSER)
     names = ("handed", "handed-rank1")
     handed = two_ranks(tmp_path, registry, "handed", "trainer.checkpoint_interval=1", "run.real_time_factor=2")
     wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
@@ -256,12 +331,33 @@ def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     assert code == 0 and all(f"{name}: trainer 1 continues" in said for name in names), said
     said, _ = handed.communicate(timeout=PATIENCE_S)
     assert handed.returncode == 0, said
-    for name, undisturbed in zip(names, ("whole", "whole-rank1"), strict=True):
-        assert tensors(tmp_path / name) == tensors(whole.folder / undisturbed)
-        written, expected = report(tmp_path / name), report(whole.folder / undisturbed)
+    assert_undisturbed(tmp_path, names, whole)
+    for name in names:
+        written = report(tmp_path / name)
         assert (len(written["handovers"]), written["restarts"]) == (1, 0)
-        assert written["observation_hash"] == expected["observation_hash"]
-        assert (written["lost_ticks"], written["duplicated_ticks"]) == (0, 0)
+
+
+def test_a_successor_that_dies_after_the_old_trainers_have_left_does_not_end_the_launch(
+    tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_modules(tmp_path, monkeypatch, killed_once=KILLED_ONCE, gives_up=GIVES_UP)
+    names = ("handed", "handed-rank1")
+    handed = two_ranks(tmp_path, registry, "handed", *EVERY_UPDATE, "run.real_time_factor=2")
+    wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
+    # One that is killed comes back.
+    code, said = answer(ask(tmp_path, registry, "handover", "handed", "--set=trainer.module=killed_once"))
+    assert code == 0 and all(f"{name}: trainer" in said for name in names), said
+    newest = latest_checkpoint(tmp_path / "handed" / "checkpoints").name
+    wait_until(lambda: latest_checkpoint(tmp_path / "handed-rank1" / "checkpoints").name > newest, handed)
+    # One that exits by itself is no learner for this launch: both ranks go back to the learner before it.
+    code, said = answer(ask(tmp_path, registry, "handover", "handed", "--set=trainer.module=gives_up"))
+    assert code == 1 and "the learner before it returns" in said, said
+    said, _ = handed.communicate(timeout=PATIENCE_S)
+    assert handed.returncode == 0, said
+    assert_undisturbed(tmp_path, names, whole)
+    for name in names:
+        run = json.loads((tmp_path / name / "run.json").read_text())
+        assert run["config"]["trainer"]["module"] == "killed_once"
 
 
 def command_lines() -> list[tuple[int, str]]:

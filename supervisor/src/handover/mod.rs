@@ -15,7 +15,7 @@ use ipc_schema::{
     board::State,
     config::Config,
     failure::{Failure, FailureKind},
-    process::{OnExit, Process},
+    process::Process,
     run::RunFile,
 };
 
@@ -91,7 +91,7 @@ impl Handovers {
         let learns_alone = processes.run().config.trainer.ranks == 1;
         match processes.state_of(Process::Trainer) {
             _ if self.current.is_some() => Some("another handover is in progress"),
-            _ if !learns_alone && request.meeting.is_none() => {
+            _ if !learns_alone && !request.together => {
                 Some("the trainer learns together with other ranks, and one rank cannot be replaced alone")
             }
             _ if processes.replaceable().is_none() => Some("the run has no trainer"),
@@ -148,8 +148,8 @@ impl Handovers {
             self.current = Some(handover);
             return Ok(false);
         }
-        // The other ranks are in the middle of a step that a killed one has left.
-        let was_killed = ended.status.signal().is_some() && ended.on_exit == OnExit::Replace;
+        // The trainers of other ranks are still at work: the killed one is started again, and all of them meet.
+        let was_killed = ended.status.signal().is_some() && !handover.is_together();
         let may_follow = was_killed || self.is_trainer_leaving;
         if ended.is_done || !may_follow {
             self.current = Some(handover);
@@ -210,7 +210,7 @@ impl Handovers {
         };
         write_run(&run, "run.json")?;
         phases::remove(&Failure::path(&run.run_dir, ended.row.process.name()));
-        processes.set_run(run);
+        processes.return_to(run);
         if let Some(handover) = self.current.take() {
             handover.refuse(failure);
         }

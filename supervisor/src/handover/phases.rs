@@ -66,7 +66,7 @@ impl HandoverInProgress {
         ready_line: Receiver<String>,
     ) -> Self {
         Self {
-            is_permitted: request.meeting.is_none(),
+            is_permitted: !request.together,
             request,
             reply,
             run,
@@ -133,7 +133,7 @@ impl HandoverInProgress {
             // A trainer that does not get ready is killed, and the successor takes over.
             HandoverPhase::Waiting { successor } => (successor, asked, "the old trainer was not ready"),
             // Ranks leave together: one that gave up alone would end the others' steps.
-            HandoverPhase::Leaving { successor } if self.request.meeting.is_some() => (successor, None, ""),
+            HandoverPhase::Leaving { successor } if self.request.together => (successor, None, ""),
             HandoverPhase::Leaving { successor } => (successor, asked, "the old trainer had not left"),
             HandoverPhase::Opening { .. } => return None,
         };
@@ -162,6 +162,12 @@ impl HandoverInProgress {
                 "logs/trainer.log in the run directory says what both do; `--now` does not wait for an update",
             )
         })
+    }
+
+    /// True if the trainers of other ranks are replaced with this one.
+    #[must_use]
+    pub fn is_together(&self) -> bool {
+        self.request.together
     }
 
     /// True while the successor prepares.

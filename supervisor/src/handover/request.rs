@@ -58,11 +58,6 @@ fn timeout_s(seconds: f64) -> Result<f64, Exit> {
     ))
 }
 
-/// A name that no other handover has.
-fn meeting() -> Result<String, Exit> {
-    Ok(format!("handover-{:016x}", registry::random_u64()?))
-}
-
 /// Asks the supervisor of a run to replace its trainer, and waits for the answer. Trainers that learn together are replaced together.
 ///
 /// # Errors
@@ -81,14 +76,14 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
         checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
         now: args.now,
         timeout_s: args.timeout_s.map(timeout_s).transpose()?,
-        meeting: (run.config.trainer.ranks > 1).then(meeting).transpose()?,
+        together: run.config.trainer.ranks > 1,
     };
     let runs = ranks(&run, args.now)?;
     let requests = runs
         .iter()
         .map(|run| SentRequest::new(run, &SupervisorRequest::Handover(request.clone())));
     let mut requests: Vec<SentRequest> = requests.collect::<Result<_, _>>()?;
-    if request.meeting.is_some() {
+    if request.together {
         // No old trainer leaves before all successors are ready: they leave after the same update.
         let refused = requests.iter_mut().find_map(|sent| match sent.answer() {
             Ok(HandoverAnswer::Refused(failure)) => Some(failure.into()),

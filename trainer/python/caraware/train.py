@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, read_run, run_process
 
 if TYPE_CHECKING:
+    from caraware.learn.meeting import Meeting
     from caraware.learn.ranks import Ranks
     from caraware.run.config import RunConfig
     from caraware.run.learner import Learner
@@ -31,10 +32,18 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
 
     from caraware.ipc.channel import Channel
     from caraware.learn import ranks
+    from caraware.run.checkpoint import remove_newer
 
     if role.gets_ready and not _get_ready(run_file, config, role):
         return
-    together = ranks.of_run(config.trainer.ranks, role.meeting)
+    meeting = _meeting(config, role, stop) if config.trainer.ranks > 1 else None
+    together = ranks.of_run(config.trainer.ranks, meeting)
+    if meeting is not None and meeting.is_over:
+        _receive_the_rest(run_file, config, stop)
+        return
+    if meeting is not None and meeting.continues():
+        # An update counts when all ranks have committed it.
+        remove_newer(config.run_dir / "checkpoints", meeting.common_checkpoint())
     learner = _successor(run_file, config, role, together) if role.replaces else _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     if learner is not None:
@@ -58,6 +67,33 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
         logging.shutdown()
         os._exit(0)
     together.close()
+
+
+def _meeting(config: "RunConfig", role: HandoverRole, stop: StopSignal) -> "Meeting":
+    """The meeting with the trainers of the other ranks, at which this one names its checkpoints."""
+    from caraware.learn.meeting import Attendance, Meeting
+    from caraware.run.manifest import sound_checkpoints
+
+    names = tuple(checkpoint.name for checkpoint in sound_checkpoints(config.run_dir / "checkpoints"))
+    return Meeting(Attendance(role.incarnation, role.handovers, names), lambda: stop.requested)
+
+
+def _receive_the_rest(run_file: Path, config: "RunConfig", stop: StopSignal) -> None:
+    """Receive what is left of the run after all ranks have written their results."""
+    from caraware.ipc.channel import Channel, StreamEndedError
+
+    log.info("all ranks had written their results before this trainer came")
+    channel = Channel(str(run_file))
+    waiting = [channel, *(channel.in_environment(index) for index in range(1, len(config.environments)))]
+    while waiting and not stop.requested:
+        for environment in list(waiting):
+            try:
+                for observation in environment.receive(0.0):
+                    environment.consumed(observation.tick)
+            except StreamEndedError:
+                environment.done()
+                waiting.remove(environment)
+        channel.wait_for_any(0.2)
 
 
 def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":

@@ -10,6 +10,7 @@ the step that one trainer with all the samples would take, and keep equal parame
 import hashlib
 import hmac
 import json
+import logging
 import os
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,13 +25,12 @@ import torch
 from torch import Tensor
 
 from caraware.learn.gpu import has_usable_gpu
+from caraware.learn.meeting import Meeting, MeetingError
+
+log = logging.getLogger("caraware.train")
 
 WAIT_AT_MOST = timedelta(hours=1)
 """For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
-MEET_WITHIN = timedelta(minutes=5)
-"""For successors, all of which are ready."""
-
-
 SECRET = "CARAWARE_RANKS_SECRET"
 """Environment variable with a text that the ranks of one launch share, and others do not know."""
 LEAST_SECRET = 16
@@ -147,6 +147,9 @@ class Ranks:
     def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
         """Raises `RankError` where they are not the same on all ranks, bit for bit."""
 
+    def note_end(self) -> None:
+        """Note that all ranks have written all their results: a successor of one has nothing to learn any more."""
+
     def close(self) -> None:
         """Part from the others, when all are done."""
 
@@ -171,11 +174,14 @@ def shared_secret(environment: Mapping[str, str]) -> bytes:
 class TorchRanks(Ranks):
     """A trainer among others that `torchrun` started (`caraware.parallel`)."""
 
-    def __init__(self, ranks: int, meeting: str | None = None) -> None:
-        """Meet the others. Raises `RankError` if they do not come, or are not `ranks`."""
+    def __init__(self, ranks: int, meeting: Meeting | None = None) -> None:
+        """Join the others. Raises `RankError` if they do not come, or are not `ranks`.
+
+        With a `meeting`, at which all have gathered, trainers that come later may form further groups.
+        """
         import torch.distributed as dist
 
-        self._dist = dist
+        self._dist, self._meeting = dist, meeting
         if (started := int(os.environ.get("WORLD_SIZE", "0"))) != ranks:
             raise RankError(f"`trainer.ranks` is {ranks}, and torchrun started {started} processes")
         self._is_shared = False
@@ -189,18 +195,11 @@ class TorchRanks(Ranks):
             if meeting is None:
                 dist.init_process_group(backend, timeout=WAIT_AT_MOST)
             else:
-                rank, store = int(os.environ["RANK"]), self._store(meeting)
-                dist.init_process_group(backend, timeout=WAIT_AT_MOST, world_size=ranks, rank=rank, store=store)
+                store = meeting.store()
+                dist.init_process_group(backend, timeout=WAIT_AT_MOST, world_size=ranks, rank=meeting.rank, store=store)
             self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
         self._authenticate(shared_secret(os.environ))
-
-    def _store(self, meeting: str) -> Any:
-        """A part of the store that `torchrun` keeps: the addresses of the old trainers are still in the whole."""
-        from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]  # see `caraware.parallel`
-
-        address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-        return PrefixStore(meeting, TCPStore(address, port, is_master=False, timeout=MEET_WITHIN))
 
     def _authenticate(self, secret: bytes) -> None:
         """Each rank proves to each other that it knows the secret. Raises `RankError` if one does not."""
@@ -220,9 +219,12 @@ class TorchRanks(Ranks):
         """What torch says of a lost connection names addresses, not what happened."""
         try:
             yield
-        except (RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise RankError(f"another rank has ended or cannot be reached ({doing}: {reason})") from error
+        except (MeetingError, RuntimeError, ValueError) as error:
+            lost = f"another rank has ended or cannot be reached ({doing}: {str(error).splitlines()[0]})"
+            if self._meeting is not None:
+                log.warning("%s; waiting for its successor", lost)
+                self._meeting.await_successor()
+            raise RankError(lost) from error
 
     def agree(self, verdict: Verdict, episode: int) -> tuple[Verdict, int]:
         """See `Ranks.agree`."""
@@ -301,14 +303,30 @@ class TorchRanks(Ranks):
         if len(set(digests)) > 1:
             raise RankError(f"{what} differ between the ranks: {', '.join(digests)}")
 
+    def note_end(self) -> None:
+        """See `Ranks.note_end`."""
+        if self._meeting is not None:
+            self._meeting.note_end()
+
     def close(self) -> None:
         """See `Ranks.close`."""
+        if self._meeting is not None:
+            self._meeting.part()
         self._dist.destroy_process_group()
 
 
-def of_run(ranks: int, meeting: str | None = None) -> Ranks:
+def of_run(ranks: int, meeting: Meeting | None = None) -> Ranks:
     """Alone, or among the others that `torchrun` started. Raises `RankError`.
 
-    Successors that meet while a launch lasts name a `meeting`, where those before them have not met.
+    With a `meeting`, waits until all have gathered there.
     """
-    return TorchRanks(ranks, meeting) if ranks > 1 else Ranks()
+    if ranks == 1:
+        return Ranks()
+    if meeting is not None:
+        try:
+            meeting.gather()
+        except MeetingError as error:
+            raise RankError(str(error)) from error
+        if meeting.is_over:
+            return Ranks()
+    return TorchRanks(ranks, meeting)

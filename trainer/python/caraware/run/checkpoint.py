@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -36,6 +37,8 @@ from caraware.run.manifest import (
 )
 from caraware.run.storage import sync_directory, when_there_is_space, write_synced, write_whole
 from caraware.run.stream_position import StreamPosition
+
+log = logging.getLogger(__name__)
 
 POINTS = "points.safetensors"
 ONLY_HERE = (COURSE, POINTS)
@@ -219,6 +222,20 @@ def load_history(checkpoint: Path) -> TrainingHistory:
     names = rest.pop("training")
     training = [TrainingPoint.of_row(row, names) for row in rows]
     return TrainingHistory(**rest | {"evaluations": evaluations, "training": training, "others": others})
+
+
+def remove_newer(folder: Path, name: str | None) -> None:
+    """Remove checkpoints newer than `name`, or all: only some of the trainers that learn together have written them."""
+    newer = [checkpoint for checkpoint in folder.glob("update-*") if name is None or checkpoint.name > name]
+    if not newer:
+        return
+    if name is None:
+        (folder / LATEST).unlink(missing_ok=True)
+    else:
+        _point(folder, LATEST, folder / name)
+    for checkpoint in newer:
+        log.warning("%s was not written by all ranks, which continue from %s: removed", checkpoint.name, name)
+        shutil.rmtree(checkpoint)
 
 
 def remove_partial(folder: Path) -> None:

@@ -103,6 +103,8 @@ class TrainingLoop:
         self._metrics.close()
         self._draw()
         self._write_part()
+        if self._ranks.all(self._ended()):
+            self._ranks.note_end()
         if self._ended():
             for environment in self._environments:
                 environment.channel.done()

@@ -1,7 +1,8 @@
 """A process in the trainer's place: signals, its part in a handover, exit codes, and how it reports a failure.
 
 Exit codes: 0 done, or stopped by SIGTERM or SIGINT after a checkpoint; 1 the run failed; 2 configuration;
-3 something is missing on this machine. A failure is reported once, in `<run>/logs/trainer.error.json`.
+3 something is missing on this machine; 75 and 76 the trainer of another rank was replaced (`caraware.learn.meeting`). A
+failure is reported once, in `<run>/logs/trainer.error.json`.
 """
 
 import json
@@ -86,18 +87,22 @@ class HandoverRole:
     """The other trainer is still running: get ready, then wait for the handover."""
     checkpoint: Path | None
     """Parameters to take instead of the newest of the run."""
-    meeting: str | None = None
-    """Where it meets the successors of the trainers that learn together; None if it learns alone."""
+    incarnation: int = 0
+    """Number of trainers of this run before it, since the run was started or resumed."""
+    handovers: int = 0
+    """Completed handovers of the run, without those that fell back."""
 
     @classmethod
     def from_environment(cls) -> "HandoverRole":
         """Without the variables, the process is the first trainer of its run."""
         checkpoint = os.environ.get("CARAWARE_CHECKPOINT")
+        incarnation = int(os.environ.get("CARAWARE_INCARNATION", "0"))
         return cls(
-            replaces=int(os.environ.get("CARAWARE_INCARNATION", "0")) > 0,
+            replaces=incarnation > 0,
             gets_ready=bool(os.environ.get("CARAWARE_SUCCESSOR")),
             checkpoint=Path(checkpoint) if checkpoint else None,
-            meeting=os.environ.get("CARAWARE_MEETING"),
+            incarnation=incarnation,
+            handovers=int(os.environ.get("CARAWARE_HANDOVERS", "0")),
         )
 
     def wait_for_turn(self, claims: SuccessorClaims | None = None) -> bool:
