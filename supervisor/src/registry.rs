@@ -254,6 +254,12 @@ fn prefix(name: &str) -> String {
     format!("caraware_{name}_")
 }
 
+/// True if the runtime directory of a run still has its marker.
+#[must_use]
+pub fn is_marked(directory: &Path) -> bool {
+    directory.join(MARKER).is_file()
+}
+
 /// A run found in the registry.
 #[derive(Debug)]
 pub struct RegistryEntry {

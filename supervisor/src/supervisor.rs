@@ -3,6 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     os::unix::process::ExitStatusExt as _,
+    path::Path,
     sync::{
         Arc,
         atomic::AtomicBool,
@@ -31,7 +32,7 @@ use crate::{
     install::Install,
     memory_limit::MemoryGroups,
     processes::{EndedProcess, RunProcesses},
-    registry::RunClaim,
+    registry::{self, RunClaim},
     restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts, lost_another},
     socket::{self, HandoverReport, ReceivedRequest},
     stall::{ProcessPlace, READY_WITHIN, StallChange, StallWatch},
@@ -184,10 +185,17 @@ impl Supervisor {
         display.update(self.processes.environments(), self.ready_at, &[]);
         display.finish();
         self.stop_all(&ending);
-        // What fails while the directory is being removed fails for want of it.
-        let ending = match (ending, self.find_run_dir()) {
-            (RunEnding::Failed(_), Err(removed)) => RunEnding::Failed(removed),
-            (ending, _) => ending,
+        // What fails while a directory is being removed fails for want of it.
+        let ending = match (ending, self.find_run_dir(), self.runtime_dir_removed()) {
+            (RunEnding::Failed(_), Err(removed), _) => RunEnding::Failed(removed),
+            (RunEnding::Failed(_), Ok(()), Some(directory)) => RunEnding::Failed(Exit::run(
+                format!(
+                    "the runtime directory {} was removed while the run was alive",
+                    directory.display()
+                ),
+                "`caraware train --resume` continues the run; CARAWARE_RUNTIME_DIR names a directory that stays until its end",
+            )),
+            (ending, ..) => ending,
         };
         RunOutcome {
             ending,
@@ -238,16 +246,24 @@ impl Supervisor {
 
     /// Reports once that the runtime directory of a live run has been removed.
     fn find_runtime_dir(&mut self) {
-        let directory = &self.processes.run().shared_memory.root;
-        if self.is_runtime_dir_lost || directory.is_dir() {
+        if self.is_runtime_dir_lost {
             return;
         }
-        self.is_runtime_dir_lost = true;
-        display::notice(&format!(
-            "the runtime directory {} was removed: the run continues, but takes no commands, and a process that dies ends it; Ctrl-C ends \
-             it with a checkpoint",
-            directory.display()
-        ));
+        if let Some(directory) = self.runtime_dir_removed() {
+            display::notice(&format!(
+                "the runtime directory {} was removed: the run takes no commands, and ends with a checkpoint when an episode begins or a \
+                 process dies",
+                directory.display()
+            ));
+            self.is_runtime_dir_lost = true;
+        }
+    }
+
+    /// The runtime directory of this run, if it has been removed: services cannot be opened any more.
+    fn runtime_dir_removed(&self) -> Option<&Path> {
+        let directory = self.processes.run().shared_memory.root.as_path();
+        // A process that is started again makes the directory itself again, but not what marks it.
+        (!registry::is_marked(directory)).then_some(directory)
     }
 
     /// Handles ended processes: a reported failure of a required one ends the run; others are started again.

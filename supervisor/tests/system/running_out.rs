@@ -1,9 +1,12 @@
 //! Whole runs that run out of shared memory, of disk space or of file handles: a clear error or a wait, never a signal or a hang.
 
 use std::{
-    fs::File,
+    fs::{DirBuilder, File},
     io::Write as _,
-    os::{fd::AsRawFd as _, unix::process::ExitStatusExt as _},
+    os::{
+        fd::AsRawFd as _,
+        unix::{fs::DirBuilderExt as _, process::ExitStatusExt as _},
+    },
     path::{Path, PathBuf},
     process::{Child, Command, Output, Stdio},
     sync::{
@@ -360,6 +363,48 @@ fn a_directory_that_vanishes_is_named() {
     assert!(words.contains("was removed while the run was alive"), "{said}");
     assert!(status.code() == Some(1) && !said.contains("panicked"), "{said}");
     assert!(workplace.shared_memory().is_empty(), "{:?}", workplace.shared_memory());
+}
+
+/// The runtime directory of a live run is removed. Nothing can be opened in it any more: sooner or later a process needs that, be it at
+/// the start of an episode or because another has died. Then the run ends, with a reason, a checkpoint and a report, and can be resumed.
+#[test]
+fn a_runtime_directory_that_vanishes_is_named() {
+    for killed in [None, Some("caraware.train"), Some("/sim-core")] {
+        let workplace = Workplace::new();
+        let said = Said(workplace.path().join("said"));
+        let mut command = workplace.command(&train("results", &["episode.training_episodes=100000"]));
+        let mut run = command.stderr(File::create(&said.0).unwrap()).spawn().unwrap();
+        let checkpoint = workplace.path().join("runs/results/checkpoints/latest");
+        until(&mut run, "checkpoint", || checkpoint.exists().then_some(()));
+        assert!(
+            !workplace.shared_memory().is_empty(),
+            "the names of its files are known"
+        );
+        std::fs::remove_dir_all(workplace.path().join("run")).unwrap();
+        // A process that has found it out by itself may have ended already.
+        if let Some(pid) = killed.and_then(|name| pid_of([name, &workplace.path().to_string_lossy()])) {
+            let _ = kill_process(pid, Signal::KILL);
+        }
+        let status = run.wait().unwrap();
+        assert_eq!(status.code(), Some(1), "{killed:?}: {status}");
+        let words = said.read().replace('│', "");
+        let words = words.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(words.contains("was removed while the run was alive"), "{killed:?}");
+        assert!(!words.contains("panicked"), "{killed:?}");
+        let report = workplace.report("results");
+        assert_eq!(report["result"], "failed", "{report:#}");
+        assert!(
+            report["failure"].to_string().contains("the runtime directory"),
+            "{report:#}"
+        );
+        assert!(report["checkpoint"].is_string(), "{report:#}");
+        workplace.assert_nothing_left();
+        let resumed = ["train", "--resume", "results", "--set", "episode.training_episodes=2"];
+        let registry = workplace.path().join("run");
+        DirBuilder::new().mode(0o700).recursive(true).create(registry).unwrap();
+        workplace.succeed(&resumed);
+        assert_eq!(workplace.report("results")["lost_ticks"], 0);
+    }
 }
 
 /// `command` in a shell that first runs `before`.
