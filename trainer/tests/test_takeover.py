@@ -93,6 +93,11 @@ def test_a_takeover_before_the_first_checkpoint_survives_a_kill_and_resumes() ->
             assert learner is not None
             learner.kill()
             _until(lambda: _committed(directory)[1] > killed_at, run, "a commit after the restart")
+            # SIGTERM amid a rollout: ticks that no update has learnt from are not committed, and come again.
+            learner, (_, asked_at) = _learner(run), _committed(directory)
+            assert learner is not None
+            learner.terminate()
+            _until(lambda: _committed(directory)[1] > asked_at, run, "a commit after the second restart")
             run.send_signal(signal.SIGINT)
             said, _ = run.communicate(timeout=60)
         finally:
@@ -101,7 +106,7 @@ def test_a_takeover_before_the_first_checkpoint_survives_a_kill_and_resumes() ->
                 run.wait(60)
         log = directory / "logs" / "trainer.log"
         begun = f"with the networks of {checkpoint}"
-        assert log.read_text().count(begun) == 2, said + log.read_text()
+        assert log.read_text().count(begun) == 3, said + log.read_text()
         _, stopped_at = _committed(directory)
 
         resume: list[str | Path] = [CARAWARE, "train", "--resume", "taken", "--quiet"]

@@ -141,7 +141,7 @@ fn damaged_nets_routes_and_scenarios_are_read_or_refused() {
     let (mut read, mut refused) = (0, 0);
     for path in &files {
         let original = std::fs::read(path).unwrap();
-        each_damaged(&original, path, 60, || {
+        each_damaged(&original, path, 75, || {
             let scenario = scenario::read(&files[3], ScenarioReading::Checked);
             match scenario.and_then(|scenario| scenario::map_info(&scenario.net_file, Some((52.0, 10.0)))) {
                 Ok(_) => read += 1,

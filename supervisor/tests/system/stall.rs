@@ -223,6 +223,22 @@ fn a_stall_is_reported_and_a_pause_or_a_stopped_supervisor_is_none() {
     assert_same(&workplace, 0);
 }
 
+/// The shutdown has a deadline: a process that does not end when it is asked to is named and killed.
+#[test]
+fn a_process_that_does_not_end_in_time_is_named_and_killed() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "held", &[PACED]);
+    run.until_consumed(50);
+    let trainer = run.pid_of(Process::Trainer).unwrap();
+    kill_process(trainer, Signal::STOP).unwrap();
+    kill_process(Pid::from_child(&run.child), Signal::TERM).unwrap();
+    run.until_said("trainer has not ended within 30 s: it is killed");
+    drop(run.boards);
+    assert_eq!(run.child.wait().unwrap().code(), Some(130));
+    assert_eq!(workplace.report("held")["result"], "interrupted");
+    workplace.assert_nothing_left();
+}
+
 /// Lets more time pass than a stall takes: what must not happen has then had its time.
 fn wait_beyond_the_limit() {
     let end = Instant::now() + Duration::from_secs(6);
