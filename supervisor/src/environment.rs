@@ -11,7 +11,7 @@ use ipc_schema::{
     services::{ControlService, RunNode, ServiceHolder},
 };
 
-use crate::{failure::Exit, resume};
+use crate::{failure::Exit, preparation_mark, resume};
 
 /// The processes that simulate an environment, those of them that a run has.
 pub const SIMULATORS: [Process; 4] = [
@@ -58,6 +58,7 @@ impl Environment {
             std::fs::create_dir_all(&path).map_err(|error| Exit::io("create", &path, &error))?;
         }
         let run_file = run.write()?;
+        preparation_mark::remove_mark(&run.run_dir).map_err(|error| Exit::io("write", &run.run_dir, &error))?;
         let services = ServiceHolder::create(node, &run, env_index)?;
         let boards = Process::ALL
             .into_iter()

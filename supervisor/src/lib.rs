@@ -25,6 +25,7 @@ pub mod metrics;
 pub mod output;
 pub mod panel;
 pub mod phase;
+pub mod preparation_mark;
 pub mod prepare;
 pub mod processes;
 pub mod record;

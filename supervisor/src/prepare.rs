@@ -20,6 +20,7 @@ use crate::{
     install::Install,
     maps,
     memory_limit::{MemoryGroups, MemoryLimit},
+    preparation_mark,
     registry::{self, RunClaim},
     remote, resume,
     scenario::{self, ScenarioReading, SumoScenario, input_check::require_regular},
@@ -374,7 +375,7 @@ pub(crate) fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory
     if let Some(name) = &args.name {
         check_name(name)?;
         let path = runs.join(name);
-        return match std::fs::create_dir(&path) {
+        return match preparation_mark::create_marked(&path) {
             Ok(()) => Ok(RunDirectory {
                 name: name.clone(),
                 path,
@@ -389,7 +390,7 @@ pub(crate) fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory
     for number in 1_u32.. {
         let name = format!("{label}-{number}");
         let path = runs.join(&name);
-        match std::fs::create_dir(&path) {
+        match preparation_mark::create_marked(&path) {
             Ok(()) => return Ok(RunDirectory { name, path }),
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
             Err(error) => return Err(Exit::io("create", &path, &error)),

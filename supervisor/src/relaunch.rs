@@ -24,6 +24,7 @@ use crate::{
     cli::{RunArgs, TrainArgs, ViewerKind},
     display::notice,
     failure::Exit,
+    preparation_mark,
     restart::{EndCause, RequiredRestarts, RestartVerdict},
 };
 
@@ -140,8 +141,8 @@ impl RelaunchedRun {
         true
     }
 
-    /// Finds the directory of the run that the dead supervisor had. A directory in which it had prepared nothing yet is removed: the
-    /// run starts again under the same name.
+    /// Finds the directory of the run that the dead supervisor had. A directory that it prepared, and that has no run file yet, is
+    /// removed: the run starts again under the same name.
     fn find_directory(&mut self) {
         let entries = std::fs::read_dir(&self.args.run.runs).into_iter().flatten().flatten();
         let named = self.args.resume.iter().map(PathBuf::from);
@@ -156,7 +157,7 @@ impl RelaunchedRun {
         if let (None, Some(claimed)) = (&self.directory, &self.claimed)
             && claimed.is_dir()
             && !claimed.join("run.json").exists()
-            && let Err(error) = std::fs::remove_dir_all(claimed)
+            && let Err(error) = preparation_mark::remove_prepared(claimed, self.supervisor_pid)
         {
             notice(&format!("cannot remove {}: {error}", claimed.display()));
         }
