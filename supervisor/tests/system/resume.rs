@@ -265,11 +265,26 @@ const COMMANDS: &str = r#"{"tick":50,"episode":0,"control":{"command":"sensor","
 {"tick":380,"episode":3,"control":{"command":"start","vehicle":"cav.3","edge":"ring_north_1"}}
 "#;
 
+/// Crates on the lanes of Main Street and Market Street.
+const CRATES: &str = r#"scene.obstacles=["crate 129 126 45", "crate 92.7 125.3", "crate 93.1 121.8", "crate 148.3 127.2",
+    "crate 137.9 124.7", "crate 167.7 93.6", "crate 171.2 93.5", "crate 170 147.3", "crate 173.5 147.2", "crate 175.2 201.5",
+    "crate 207.6 112.8", "crate 209.7 116"]"#;
+
+/// Ticks of the contacts in the log of a run.
+fn contact_ticks(contacts: &str) -> Vec<u64> {
+    let line = |line| serde_json::from_str::<Value>(line).unwrap();
+    contacts
+        .lines()
+        .map(|text| line(text)["tick"].as_u64().unwrap())
+        .collect()
+}
+
+/// The log of contacts keeps those of the earlier part, and has each of the others once.
 #[test]
-fn commands_after_the_checkpoint_are_carried_out_again() {
+fn commands_after_the_checkpoint_are_carried_out_again_and_contacts_are_kept() {
     let workplace = Workplace::new();
     let file = workplace.write("commands.jsonl", COMMANDS);
-    let commanded = |name| [&arguments(name, &[])[..], &["--commands", file.to_str().unwrap()]].concat();
+    let commanded = |name| [&arguments(name, &[CRATES])[..], &["--commands", file.to_str().unwrap()]].concat();
     workplace.succeed(&commanded("whole"));
     assert_same_end_from_every_checkpoint(&workplace, "commands.jsonl", &["update-000002", "update-000008"]);
     let beginning = |name: &str| workplace.report(name)["beginning"].clone();
@@ -277,6 +292,17 @@ fn commands_after_the_checkpoint_are_carried_out_again() {
     assert_eq!(beginning("update-000008")["resets"], 2);
     stop_and_resume(&workplace, "cut", &commanded("cut"), "update-000004");
     assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    let contacts =
+        |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("events/collisions.jsonl")).unwrap();
+    let resumed_at = beginning("cut")["episode_tick"].as_u64().unwrap();
+    let (earlier, later): (Vec<u64>, Vec<u64>) = contact_ticks(&contacts("whole"))
+        .into_iter()
+        .partition(|tick| *tick < resumed_at);
+    assert!(
+        !earlier.is_empty() && !later.is_empty(),
+        "{earlier:?}, {resumed_at}, {later:?}"
+    );
+    assert_eq!(contacts("cut"), contacts("whole"));
     workplace.assert_nothing_left();
 }
 
