@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::common::{Spectator, Workplace, text, until};
+use crate::common::{Spectator, Workplace, free_port, text, until};
 use ipc_schema::process::Process;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -140,20 +140,15 @@ fn assert_same(workplace: &Workplace, restarts: u64) {
     workplace.assert_nothing_left();
 }
 
-#[test]
-fn each_process_that_is_stopped_is_named_and_replaced_and_nothing_changes() {
+/// Stops each of `processes` in a run with these settings, and asserts that it is named and replaced, and that the run ends as the
+/// undisturbed one.
+fn assert_replaced(settings: &[&str], processes: &[Process]) {
     let workplace = Workplace::new();
-    let replace = ["run.stall_s=5", "run.on_stall=replace", PACED];
-    let mut run = Run::start(&workplace, "stopped", &replace);
-    let processes = [
-        Process::TrafficBridge,
-        Process::SimCore,
-        Process::SensorDaemon,
-        Process::Trainer,
-    ];
+    let replace = ["run.stall_s=5", "run.on_stall=replace"];
+    let mut run = Run::start(&workplace, "stopped", &[&replace, settings].concat());
     for process in processes {
         run.until_consumed(100);
-        let pid = run.pid_of(process).unwrap();
+        let pid = run.pid_of(*process).unwrap();
         kill_process(pid, Signal::STOP).unwrap();
         run.until_said(&format!(
             "{process} has made no progress for 5 s: a signal or a debugger has stopped it"
@@ -161,13 +156,42 @@ fn each_process_that_is_stopped_is_named_and_replaced_and_nothing_changes() {
         let gone = format!("/proc/{}", pid.as_raw_nonzero());
         until(&mut run.child, "its end", || (!Path::new(&gone).exists()).then_some(()));
     }
-    let log = std::fs::read_to_string(run.run_dir.join("logs/sim-core.log")).unwrap();
-    assert!(log.contains("caraware: sim-core has made no progress for 5 s"), "{log}");
+    for process in processes {
+        let log = std::fs::read_to_string(run.run_dir.join(format!("logs/{process}.log"))).unwrap();
+        let note = format!("caraware: {process} has made no progress for 5 s");
+        assert!(log.contains(&note), "{log}");
+    }
     let said = run.end();
     // The other processes wait meanwhile, and are not named.
     let named = said.lines().filter(|line| line.contains("; it is killed")).count();
     assert_eq!(named, processes.len(), "{said}");
-    assert_same(&workplace, 4);
+    assert_same(&workplace, processes.len() as u64);
+}
+
+#[test]
+fn each_process_that_is_stopped_is_named_and_replaced_and_nothing_changes() {
+    let processes = [
+        Process::TrafficBridge,
+        Process::SimCore,
+        Process::SensorDaemon,
+        Process::Trainer,
+    ];
+    assert_replaced(&[PACED], &processes);
+}
+
+/// While the fan-out or a recorder that watches is stopped, the run continues: its pace leaves time for both.
+#[test]
+fn a_stopped_fan_out_recorder_or_v2x_is_named_and_replaced_and_nothing_changes() {
+    let listen = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
+    let settings = [
+        "run.real_time_factor=5",
+        "v2x.share=1.0",
+        "record.manner=watching",
+        "fanout.enabled=true",
+        &listen,
+    ];
+    let processes = [Process::Fanout, Process::Recorder, Process::V2x];
+    assert_replaced(&settings, &processes);
 }
 
 #[test]
