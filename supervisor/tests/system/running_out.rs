@@ -1,8 +1,10 @@
 //! Whole runs that run out of shared memory, of disk space or of file handles: a clear error or a wait, never a signal or a hang.
 
 use std::{
+    collections::BTreeSet,
     fs::{DirBuilder, File},
     io::Write as _,
+    net::TcpStream,
     os::{
         fd::AsRawFd as _,
         unix::{fs::DirBuilderExt as _, process::ExitStatusExt as _},
@@ -17,8 +19,8 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::common::{Workplace, text, until, with_mounts};
-use rustix::process::{Pid, Signal, kill_process};
+use crate::common::{Workplace, free_port, text, until, with_mounts};
+use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, prlimit};
 
 /// A short training run of six vehicles, without viewers.
 const SHORT: [&str; 11] = [
@@ -440,6 +442,96 @@ fn too_few_file_handles_are_an_error_that_names_the_limit() {
         assert!(output.status.success(), "{before}: {}", text(&output));
     }
     workplace.assert_nothing_left();
+}
+
+/// Numbers of the files that a process has open.
+fn open_files(pid: Pid) -> BTreeSet<u64> {
+    let numbers = std::fs::read_dir(format!("/proc/{}/fd", pid.as_raw_nonzero())).unwrap();
+    let numbers = numbers.flatten();
+    numbers
+        .filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+        .collect()
+}
+
+/// Lowers the soft limit of a running process: from now on it may open files with numbers below `limit` only.
+fn limit_open_files(pid: Pid, limit: u64) {
+    let limit = Rlimit {
+        current: Some(limit),
+        maximum: getrlimit(Resource::Nofile).maximum,
+    };
+    prlimit(Some(pid), Resource::Nofile, limit).unwrap();
+}
+
+/// The exit code of a run that must end by itself within two minutes.
+fn exit_code_in_time(run: &mut Child) -> i32 {
+    let begun = Instant::now();
+    loop {
+        if let Some(status) = run.try_wait().unwrap() {
+            return status
+                .code()
+                .unwrap_or_else(|| panic!("the run ended with a signal: {status}"));
+        }
+        assert!(begun.elapsed() < Duration::from_secs(120), "the run hangs");
+        std::thread::park_timeout(Duration::from_millis(20));
+    }
+}
+
+/// A process that can open no further file ends the run with an error that says so, as soon as it needs one; the supervisor needs
+/// some to replace another process. The fan-out does without: no viewer is let in, and the run is completed.
+#[test]
+fn a_process_that_runs_out_of_file_handles_ends_the_run_with_an_error() {
+    let processes = [
+        "supervisor",
+        "/traffic-bridge",
+        "/sim-core",
+        "/sensor-daemon",
+        "caraware.train",
+        "/fanout",
+    ];
+    for exhausted in processes {
+        let workplace = Workplace::new();
+        let here = workplace.path().to_string_lossy().into_owned();
+        let said = Said(workplace.path().join("said"));
+        let port = free_port();
+        let listen = format!("fanout.listen=tcp/127.0.0.1:{port}");
+        let settings = [
+            "episode.training_episodes=8",
+            "run.real_time_factor=20",
+            "fanout.enabled=true",
+            &listen,
+        ];
+        let mut command = workplace.command(&train("handles", &settings));
+        let mut run = command.stderr(File::create(&said.0).unwrap()).spawn().unwrap();
+        let checkpoint = workplace.path().join("runs/handles/checkpoints/latest");
+        until(&mut run, "checkpoint", || checkpoint.exists().then_some(()));
+        if exhausted == "supervisor" {
+            // What it closes at the end it may use for cleaning up.
+            let supervisor = Pid::from_child(&run);
+            limit_open_files(supervisor, open_files(supervisor).len() as u64);
+            kill_process(pid_of(["/sim-core", &here]).unwrap(), Signal::KILL).unwrap();
+        } else {
+            let pid = pid_of([exhausted, &here]).unwrap();
+            let open = open_files(pid);
+            limit_open_files(pid, (0..).find(|number| !open.contains(number)).unwrap());
+        }
+        let _viewers: Vec<_> = (0..4).map(|_| TcpStream::connect(("127.0.0.1", port))).collect();
+        let code = exit_code_in_time(&mut run);
+        let report = workplace.report("handles");
+        let failure = report["failure"].to_string();
+        // The files that the end of another process closes may suffice for its replacement.
+        let may_complete = ["supervisor", "/fanout"].contains(&exhausted);
+        if may_complete && report["result"] == "completed" {
+            assert_eq!((code, &report["lost_ticks"]), (0, &0.into()), "{exhausted}");
+        } else {
+            assert_eq!((code, &report["result"]), (1, &"failed".into()), "{exhausted}");
+            assert!(
+                exhausted != "/fanout" && failure.contains("Too many open files"),
+                "{exhausted}: {failure}"
+            );
+        }
+        assert!(!said.read().contains("panicked"), "{exhausted}");
+        workplace.assert_nothing_left();
+    }
 }
 
 /// A control group with a limit on memory. Dropping it removes it.
