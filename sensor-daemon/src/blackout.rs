@@ -34,6 +34,12 @@ impl BlackoutPhase {
     pub fn is_dark(&self) -> bool {
         self.number % 2 == 1
     }
+
+    /// Time at which the gap or the blackout ends, nanoseconds.
+    #[must_use]
+    pub fn until_ns(&self) -> u64 {
+        self.until_ns
+    }
 }
 
 impl BlackoutSchedule {
@@ -61,18 +67,8 @@ impl BlackoutSchedule {
         }
     }
 
-    /// Advances to `now_ns`. Returns true if a gap or a blackout has ended.
-    #[inline]
-    pub fn advance(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) -> bool {
-        let has_ended = now_ns >= phase.until_ns;
-        if has_ended {
-            self.pass(phase, episode_seed, id_hash, now_ns);
-        }
-        has_ended
-    }
-
-    /// Passes over the gaps and blackouts that have ended by `now_ns`.
-    fn pass(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) {
+    /// Advances to `now_ns`, over the gaps and blackouts that have ended by then.
+    pub fn advance(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) {
         while now_ns >= phase.until_ns {
             phase.number = phase.number.wrapping_add(1);
             let [place, _] = self

@@ -22,6 +22,8 @@ pub struct SensorCarrier {
     pub scales: SpeedSteeringScales,
     /// Position of each sensor in its sequence of blackouts; of those that have none, the start.
     pub phases: [BlackoutPhase; SensorKind::COUNT],
+    /// Time at which the first of these phases ends, nanoseconds.
+    pub phases_until_ns: u64,
     /// Sensors that are in a blackout, by their phases.
     pub blacked_out: u32,
     /// Step of the newest sample of each sensor.
@@ -58,6 +60,7 @@ impl SensorCarrier {
             walk,
             scales,
             phases: [BlackoutPhase::default(); SensorKind::COUNT],
+            phases_until_ns: u64::MAX,
             blacked_out: 0,
             sampled: [0; SensorKind::COUNT],
             present,

@@ -117,22 +117,44 @@ impl SensorSuite {
             carrier.arms = self.mounted.arms(carrier.suite);
         }
         // No road user appears in a blackout.
-        for (kind, schedule) in &self.schedules {
+        for (kind, schedule) in self.schedules_of(carrier.present) {
             carrier.phases[kind.index()] = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
         }
+        carrier.phases_until_ns = self.next_end_ns(&carrier);
         carrier
+    }
+
+    /// Those of the sensors `present` that have blackouts.
+    fn schedules_of(&self, present: u32) -> impl Iterator<Item = &(SensorKind, BlackoutSchedule)> {
+        self.schedules.iter().filter(move |(kind, _)| kind.is_in(present))
+    }
+
+    /// Time at which the first gap or blackout of a carrier ends, nanoseconds; never without any.
+    fn next_end_ns(&self, carrier: &SensorCarrier) -> u64 {
+        let ends_ns = self
+            .schedules_of(carrier.present)
+            .map(|(kind, _)| carrier.phases[kind.index()].until_ns());
+        ends_ns.min().unwrap_or(u64::MAX)
     }
 
     /// Advances the blackouts of a carrier's sensors to this tick.
     #[inline]
     pub fn advance(&self, carrier: &mut SensorCarrier, id_hash: u64, now: &TickTime) {
-        for (kind, schedule) in &self.schedules {
-            let phase = &mut carrier.phases[kind.index()];
-            if schedule.advance(phase, now.episode_seed, id_hash, now.time_ns) {
-                let others = carrier.blacked_out & !kind.bit();
-                carrier.blacked_out = others | if phase.is_dark() { kind.bit() } else { 0 };
-            }
+        if now.time_ns >= carrier.phases_until_ns {
+            self.pass_ends(carrier, id_hash, now);
         }
+    }
+
+    /// Passes over the gaps and blackouts of a carrier's sensors that have ended.
+    #[cold]
+    fn pass_ends(&self, carrier: &mut SensorCarrier, id_hash: u64, now: &TickTime) {
+        for (kind, schedule) in self.schedules_of(carrier.present) {
+            let phase = &mut carrier.phases[kind.index()];
+            schedule.advance(phase, now.episode_seed, id_hash, now.time_ns);
+            let others = carrier.blacked_out & !kind.bit();
+            carrier.blacked_out = others | if phase.is_dark() { kind.bit() } else { 0 };
+        }
+        carrier.phases_until_ns = self.next_end_ns(carrier);
     }
 
     /// Plans the random numbers that [`SensorSuite::sample`] takes at this tick, in the order in which it takes them.
