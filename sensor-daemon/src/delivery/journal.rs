@@ -18,6 +18,8 @@ const CHUNK_BYTES: usize = 4 << 20;
 const CHUNKS: usize = 8;
 /// Bytes held in memory before the file is used.
 const MEMORY_BYTES: usize = 64 << 20;
+/// Most free chunks that stay in memory: as many as a commit usually frees. What a slow learner needed beyond goes back to the system.
+const FREE_IN_MEMORY: usize = 4;
 
 /// The journal cannot store or deliver a tick.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +65,12 @@ enum ChunkStorage {
     Memory(Vec<u8>),
     /// Number of the chunk in the file.
     File(u64),
+}
+
+impl ChunkStorage {
+    fn is_memory(&self) -> bool {
+        matches!(self, Self::Memory(_))
+    }
 }
 
 /// One message in a chunk.
@@ -288,7 +296,7 @@ impl Journal {
             self.warn();
             self.free_first();
         }
-        let place = match self.free.pop() {
+        let place = match self.free.pop_if(|place| place.is_memory()) {
             Some(place) => place,
             None => self.new_place()?,
         };
@@ -306,6 +314,9 @@ impl Journal {
             self.memory_chunks += 1;
             return Ok(ChunkStorage::Memory(Vec::with_capacity(self.chunk_bytes)));
         }
+        if let Some(place) = self.free.pop() {
+            return Ok(place);
+        }
         if self.file.is_none() {
             let file = storage::when_there_is_space(&self.directory, || unlinked_file(&self.directory));
             self.file = Some(file.map_err(failed("create", &self.directory))?);
@@ -322,6 +333,11 @@ impl Journal {
 
     fn free_first(&mut self) {
         if let Some(chunk) = self.chunks.pop_front() {
+            let free_in_memory = self.free.iter().filter(|place| place.is_memory()).count();
+            if chunk.place.is_memory() && free_in_memory >= FREE_IN_MEMORY {
+                self.memory_chunks -= 1;
+                return;
+            }
             self.free.push(chunk.place);
             // Memory is reused before the file, which costs a system call for each message.
             self.free.sort_by_key(|place| match place {
@@ -403,7 +419,7 @@ mod tests {
         assert!(journal.file.is_some(), "90 MiB are more than the memory part");
         (0..90).for_each(|tick| check(&journal, tick));
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0);
-        // Freed chunks are reused: never more than 130 MiB are held, 64 of them in memory, in chunks of 4.
+        // Freed chunks are reused: never more than 130 MiB are held, at most 64 of them in memory, in chunks of 4.
         for _ in 0..5 {
             journal.commit(journal.ticks());
             fill(&mut journal, 40, 1 << 20);
@@ -411,6 +427,23 @@ mod tests {
         let len = journal.file.as_ref().unwrap().metadata().unwrap().len();
         assert!(len <= 72 << 20, "{len} bytes in the file");
         (journal.first()..journal.ticks()).for_each(|tick| check(&journal, tick));
+    }
+
+    #[test]
+    fn memory_that_is_no_longer_needed_goes_back_to_the_system() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut journal = Journal::new(directory.path(), 1 << 30, 1000);
+        fill(&mut journal, 52, 1 << 20);
+        assert_eq!(journal.memory_chunks, 13);
+        for _ in 0..3 {
+            journal.commit(journal.ticks());
+            fill(&mut journal, 8, 1 << 20);
+            (journal.first()..journal.ticks()).for_each(|tick| check(&journal, tick));
+        }
+        // Two commits of 8 MiB and the chunks at both ends are in use.
+        let (used, free) = (journal.chunks.len(), journal.free.len());
+        assert_eq!(journal.memory_chunks, used + free);
+        assert!(used <= 6 && free <= FREE_IN_MEMORY, "{used} chunks in use, {free} free");
     }
 
     #[test]
