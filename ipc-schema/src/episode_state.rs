@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
-    failure::{Failure, FailureKind},
+    failure::{FILE_HELP, Failure, FailureKind},
     process::Process,
     run::RunFile,
     storage,
@@ -102,5 +102,5 @@ fn failed(action: &str, path: &Path, reason: &dyn std::fmt::Display) -> Failure 
         FailureKind::Run,
         format!("cannot {action} {}: {reason}", path.display()),
     )
-    .with_help("check permissions and free space (`caraware doctor`)")
+    .with_help(FILE_HELP)
 }

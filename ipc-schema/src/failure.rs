@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::storage;
 
+/// Help where the system has refused an operation on a file.
+pub const FILE_HELP: &str = "check permissions, free space and the limit on open files (`caraware doctor`)";
+
 /// Kind of a failure; it decides the exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

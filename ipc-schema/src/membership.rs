@@ -14,7 +14,7 @@ use crate::{
     activity::{Activity, Awaited},
     board::{Health, MessageStream, Progress, State},
     clock, episode_state,
-    failure::{Failure, FailureKind},
+    failure::{FILE_HELP, Failure, FailureKind},
     header::MessageHeader,
     ports::{BoardError, BoardReader, BoardWriter, ControlServer, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
@@ -476,8 +476,7 @@ impl RunMembership {
     pub fn write_part(&self, part: &impl serde::Serialize) -> Result<(), Failure> {
         let path = self.run.run_dir.join("parts").join(format!("{}.json", self.process));
         let failed = |reason: &dyn std::fmt::Display| {
-            Failure::new(FailureKind::Run, format!("cannot write {}: {reason}", path.display()))
-                .with_help("check permissions and free space (`caraware doctor`)")
+            Failure::new(FailureKind::Run, format!("cannot write {}: {reason}", path.display())).with_help(FILE_HELP)
         };
         let mut part = serde_json::to_value(part).map_err(|error| failed(&error))?;
         let used = serde_json::to_value(Usage::so_far(self.start_cpu_s)).map_err(|error| failed(&error))?;

@@ -192,12 +192,10 @@ impl ProcessSpec {
         self.on_exit != OnExit::Restart || self.process == Process::Recorder && (self.holds_up_ticks)(run)
     }
 
-    /// What its end means in `run`. Trainers that learn together take every step together, so none of them can be replaced alone; and a
-    /// run may be worth nothing without its recording.
+    /// What its end means in `run`: a run may be worth nothing without its recording.
     #[must_use]
     pub fn on_exit(&self, run: &RunFile) -> OnExit {
         match self.on_exit {
-            OnExit::Replace if run.config.trainer.ranks > 1 => OnExit::Required,
             OnExit::Restart
                 if self.process == Process::Recorder && run.config.record.on_death == DeathAction::EndRun =>
             {

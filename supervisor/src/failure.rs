@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use ipc_schema::{
-    failure::{Failure, FailureKind},
+    failure::{FILE_HELP, Failure, FailureKind},
     ports::{BoardError, PortError},
     run::RunFileError,
     services::ServiceError,
@@ -81,10 +81,7 @@ impl Exit {
 
     /// An operation on a file that the system refused.
     pub fn io(action: &str, path: &std::path::Path, error: &std::io::Error) -> Self {
-        Self::run(
-            format!("cannot {action} {}: {error}", path.display()),
-            "check permissions and free space (`caraware doctor`)",
-        )
+        Self::run(format!("cannot {action} {}: {error}", path.display()), FILE_HELP)
     }
 }
 

@@ -262,11 +262,7 @@ impl RunProcesses {
             row,
             status,
             is_done: environment.state_of(row.process) == State::Done,
-            on_exit: match row.on_exit {
-                // Also where it learns together with other ranks: their trainers follow (decision 51).
-                OnExit::Replace => OnExit::Replace,
-                _ => row.on_exit(self.run()),
-            },
+            on_exit: row.on_exit(self.run()),
             env_index: self.running[index].env_index,
         })
     }

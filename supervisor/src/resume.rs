@@ -285,7 +285,8 @@ fn commands(run_dir: &Path) -> Result<Vec<Action>, Exit> {
         match std::fs::read_to_string(&path) {
             Ok(text) => control::actions(&text).map_err(|(line, reason)| wrong(format!("line {line}: {reason}"))),
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-            Err(error) => Err(wrong(error.to_string())),
+            Err(error) if error.kind() == ErrorKind::InvalidData => Err(wrong(error.to_string())),
+            Err(error) => Err(Exit::io("read", &path, &error)),
         }
     };
     let mut actions = read(control::COMMAND_LOG)?;

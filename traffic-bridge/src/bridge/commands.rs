@@ -12,7 +12,7 @@ use ipc_schema::{
         Action, COMMAND_LOG, COMMAND_REPLAY, Command, Done, EVERY_VEHICLE, MAX_SWITCHES, Refusal, RefusalKind, Reply,
         SWITCHED_ON, SensorSwitch, Switch, actions,
     },
-    failure::{Failure, FailureKind},
+    failure::{FILE_HELP, Failure, FailureKind},
     sensor::SENSORS,
     storage,
     traffic::{Kind, MetaEvent, VehicleMeta, id_hash},
@@ -296,7 +296,7 @@ impl CommandExecutor {
                 FailureKind::Run,
                 format!("cannot write {}: {error}", self.log_path.display()),
             )
-            .with_help("check permissions and free space (`caraware doctor`)")
+            .with_help(FILE_HELP)
         };
         if self.log.is_none() {
             let file = OpenOptions::new().create(true).append(true).open(&self.log_path);

@@ -9,7 +9,7 @@ use std::{
 
 use ipc_schema::{
     config::StageConfig,
-    failure::{Failure, FailureKind},
+    failure::{FILE_HELP, Failure, FailureKind},
     membership::{RunMembership, Wait},
     ports::BoardReader,
     process::Process,
@@ -199,8 +199,7 @@ fn read(path: &Path) -> Result<Vec<StageDecision>, Failure> {
 }
 
 fn unwritten(path: &Path, error: &std::io::Error) -> Failure {
-    Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display()))
-        .with_help("check permissions and free space (`caraware doctor`)")
+    Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display())).with_help(FILE_HELP)
 }
 
 #[cfg(test)]
