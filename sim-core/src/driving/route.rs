@@ -20,7 +20,7 @@ pub struct Crossing {
     pub from_m: f64,
     /// Station at which it ends, metres.
     pub to_m: f64,
-    /// No other way has precedence, where no traffic light decides.
+    /// No vehicle has precedence, where no traffic light decides.
     pub has_right_of_way: bool,
 }
 

@@ -58,10 +58,23 @@ std::map<std::pair<std::string, std::string>, Light> lights() {
     return result;
 }
 
+bool is_for_people_alone(const std::string& lane) {
+    return engine::Lane::getAllowed(lane) == std::vector<std::string>{"pedestrian"};
+}
+
+// Whether no vehicle has precedence over a link where no traffic light decides. SUMO's letter of a major link ("M") is not enough:
+// one that gives way to a crossing alone has that of a minor link ("m"), or that of right before left ("=").
+bool has_right_of_way(const std::string& from, const libsumo::TraCIConnection& link) {
+    if (link.state != "m" && link.state != "=") {
+        return link.state == "M";
+    }
+    const std::vector<std::string> foes = engine::Lane::getFoes(from, link.approachedLane);
+    return std::all_of(foes.begin(), foes.end(), is_for_people_alone);
+}
+
 RawWay way(std::uint32_t edge, const std::string& from, const libsumo::TraCIConnection& link) {
     RawWay result{edge, number_of(from), number_of(link.approachedLane), engine::Lane::getMaxSpeed(from), {}, -1, 0,
-                  // SUMO's letter of a link that is major; those of traffic lights follow their program.
-                  link.state == "M"};
+                  has_right_of_way(from, link)};
     std::string internal = link.approachedInternal;
     for (int count = 0; !internal.empty() && count < MAX_INTERNAL_LANES; ++count) {
         append(result.shape, internal);

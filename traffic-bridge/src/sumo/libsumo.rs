@@ -139,7 +139,7 @@ pub mod ffi {
         signal: i32,
         /// Number of the way at that traffic light.
         link: u32,
-        /// No other way has precedence over it.
+        /// No vehicle has precedence over it, where no traffic light decides.
         has_right_of_way: bool,
     }
 

@@ -5,6 +5,7 @@ mod interpolation;
 mod lifecycle;
 mod population;
 mod process;
+mod right_of_way;
 mod scenario;
 mod signals;
 mod support;
