@@ -34,6 +34,9 @@ const DEADLINE: Duration = Duration::from_secs(300);
 const LONGEST_PAUSE_S: f64 = 1.5;
 /// Mean distance of two disturbances, seconds.
 const MEAN_S: f64 = 0.8;
+/// Time after which another disturbance is tried where the process of one was not there. A short run would end before its deck does
+/// if such a try cost as much as a disturbance.
+const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 /// A larger file of a run with faults is not kept.
 const MOST_KEPT_BYTES: u64 = 4 << 20;
 /// Viewers at once.
@@ -249,12 +252,14 @@ impl<'a> DisturbedRun<'a> {
             if Instant::now() >= due
                 && let Some(card) = self.cards.pop()
             {
-                if !self.carry_out(card)? {
-                    // The process was not there: later.
+                due = if self.carry_out(card)? {
+                    last = Instant::now();
+                    self.next_moment()
+                } else {
+                    // The process was not there: after all others.
                     self.cards.insert(0, card);
-                }
-                last = Instant::now();
-                due = self.next_moment();
+                    Instant::now() + RETRY_INTERVAL
+                };
             }
             if last.elapsed() > DEADLINE {
                 self.fault(&format!(
