@@ -13,7 +13,7 @@ ARGS ?=
 GPU ?= $(if $(wildcard /dev/nvidiactl /dev/dxg /proc/driver/nvidia/version),1,0)
 # Directory of `make install`, and what the installed package can do beside training: extras of trainer/pyproject.toml.
 PREFIX ?=
-EXTRAS ?= envs,data,metrics
+EXTRAS ?= envs,data,metrics,study
 
 .PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
 	timed-packages timed-programs with-cuda newcomer model deny bench peers peers-metadrive peers-smarts faces site clean

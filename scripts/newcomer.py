@@ -323,6 +323,8 @@ def refusal(line: str) -> str | None:
             return refused_by("caraware_viewer.__main__", [word for word in arguments if word != "&"])
         case ["caraware", "reproduce", *arguments]:
             return refused_by("caraware.study.reproduce", arguments)
+        case ["caraware", "study", *arguments]:
+            return refused_by("caraware.trials.study", arguments)
         case ["caraware", "report", *arguments]:
             return refused_by("caraware.report.document", arguments)
         case ["caraware", "bench", *arguments]:

@@ -60,6 +60,7 @@ NAVIGATION = {
         "docs/cooperation",
         "docs/curriculum",
         "docs/parallel",
+        "docs/trials",
         "docs/paper",
         "docs/reproduce",
     ],

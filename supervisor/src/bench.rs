@@ -1,5 +1,5 @@
-//! `caraware bench`, `caraware reproduce` and `caraware report`: start the program `caraware-bench`, which lies beside this one, and
-//! modules of Python.
+//! `caraware bench`, `caraware reproduce`, `caraware study` and `caraware report`: start the program `caraware-bench`, which lies beside
+//! this one, and modules of Python.
 
 use std::{ffi::OsString, os::unix::process::CommandExt as _, process::Command};
 
@@ -21,6 +21,14 @@ pub fn bench(arguments: &[OsString]) -> Result<(), Exit> {
 /// The Python environment is missing, or the system cannot start it.
 pub fn reproduce(arguments: &[OsString]) -> Result<(), Exit> {
     install::become_module("caraware.study.reproduce", arguments)
+}
+
+/// Replaces this process by the search for the best values of keys; returns only if that fails.
+///
+/// # Errors
+/// The Python environment is missing, or the system cannot start it.
+pub fn study(arguments: &[OsString]) -> Result<(), Exit> {
+    install::become_module("caraware.trials", arguments)
 }
 
 /// Replaces this process by the program that writes what runs have reached; returns only if that fails.

@@ -131,6 +131,16 @@ pub enum Subcommands {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
         arguments: Vec<OsString>,
     },
+    /// Search for the values of keys with which runs do best
+    #[command(
+        disable_help_flag = true,
+        after_help = "`caraware study --help` lists the options; docs/trials.md describes them."
+    )]
+    Study {
+        /// The study and its options, as the module `caraware.trials` takes them
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
+        arguments: Vec<OsString>,
+    },
     /// Measure a table of the docs again, and fail where a figure leaves its interval
     #[command(
         disable_help_flag = true,

@@ -56,6 +56,7 @@ fn main() -> ExitCode {
         Subcommands::Import(args) => import::import(&args),
         Subcommands::Bench { arguments } => bench::bench(&arguments),
         Subcommands::Reproduce { arguments } => bench::reproduce(&arguments),
+        Subcommands::Study { arguments } => bench::study(&arguments),
         Subcommands::Doctor { clean } => doctor::doctor(clean),
     };
     match result {

@@ -18,6 +18,7 @@ MAY_IMPORT = {
     "fusion": {"ipc", "baselines", "tasks", "learn", "report", "run"},
     "cooperation": {"ipc"},
     "study": {"ipc", "baselines", "tasks", "learn", "report", "run", "cooperation"},
+    "trials": {"run"},
     "examples": {"ipc", "tasks", "envs", "run"},
     "driving": {"ipc", "tasks", "learn", "run", "examples"},
 }
