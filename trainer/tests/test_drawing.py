@@ -182,7 +182,7 @@ def test_a_rollout_that_grows_keeps_what_was_drawn() -> None:
 def driven(**changes: Tensor) -> DrivenStep:
     """A tick at 10 m/s in the lane, at the limit, without force."""
     zero, no = torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.bool)
-    step = {
+    step: dict[str, Any] = {
         "progress_m": zero + 1,
         "offset_m": zero,
         "speed_mps": zero + 10,

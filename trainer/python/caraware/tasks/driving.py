@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import import_module
 
 import torch
@@ -14,6 +15,7 @@ from caraware.ipc.stream import MeasuredTick
 from caraware.tasks import ends
 from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep
 from caraware.tasks.fields import Fields
+from caraware.tasks.foresight import HORIZON_S, Around
 from caraware.tasks.metrics import metrics_of
 
 ARRIVED_WITHIN_M = 5.0
@@ -22,6 +24,12 @@ FAR_M = 999.0
 """Beyond it `route_left` is at the end of its range and does not tell progress."""
 END_REWARD = 10.0
 """Of an arrival; any other end of its own costs as much: 100 m of progress."""
+FORESEEN_COST = 0.5
+"""Of a contact that is about to happen at 10 m/s, in each tick before it."""
+WAITING_COST, WAITS_MPS = 0.02, 1.0
+"""Of a tick slower than that: as much as 20 cm of progress."""
+CAREFUL_END_COST = 15.0
+"""Of an end of its own other than an arrival, by `careful_reward`."""
 
 
 class OutcomeMissingError(ValueError):
@@ -73,6 +81,16 @@ class DrivenStep:
     """i64 `[n]`: bits of `caraware.tasks.ends`."""
     action: Tensor
     """f `[n, 2]`: steering and acceleration as the policy chose them."""
+    around: Around | None = None
+    """What moves around them after the tick, for `contact_s`."""
+
+    @cached_property
+    def contact_s(self) -> Tensor:
+        """Seconds until they touch somebody if all move on as they do; infinite beyond 2.5 s.
+
+        Only the fields of `observation.fields = "driver"` show it: infinite without them.
+        """
+        return torch.full_like(self.progress_m, torch.inf) if self.around is None else self.around.contact_s()
 
 
 DrivingReward = Callable[[DrivenStep], Tensor]
@@ -93,6 +111,18 @@ def progress_reward(step: DrivenStep) -> Tensor:
     paid = torch.where(progress > 0, progress * lane * legal * comfort, progress)
     end = torch.where(step.arrived, END_REWARD, torch.where(step.failed, -END_REWARD, 0.0))
     return torch.where(step.ended, end, paid)
+
+
+def careful_reward(step: DrivenStep) -> Tensor:
+    """`progress_reward`, less costs of every contact that is foreseen and of standing; a failure costs 15.
+
+    A collision is rare and late: the first cost says in each tick before it what leads there. It grows with the speed
+    and with the square of how near the contact is. As it is nothing for what stands, standing has a small one itself:
+    without it a policy learns to wait for ever, and so do those behind it.
+    """
+    near = (1 - step.contact_s / HORIZON_S).clamp(0, 1)
+    cost = FORESEEN_COST * (step.speed_mps / 10) * near.square() + WAITING_COST * (step.speed_mps < WAITS_MPS)
+    return torch.where(step.ended & step.failed, -CAREFUL_END_COST, progress_reward(step) - cost * ~step.ended)
 
 
 @dataclass(frozen=True)
@@ -152,6 +182,7 @@ class Driving:
             ended=outcome.terminated | outcome.truncated,
             ended_by=why,
             action=action,
+            around=Around(self.fields, outcome.next.observation, after[:, 3], yaw_rate),
         )
 
     def measure(self, step: TaskStep, action: Tensor) -> dict[str, Tensor]:
