@@ -61,6 +61,7 @@ NAVIGATION = {
         "docs/curriculum",
         "docs/parallel",
         "docs/trials",
+        "docs/cluster",
         "docs/paper",
         "docs/reproduce",
     ],

@@ -171,7 +171,7 @@ def test_an_interrupted_or_killed_search_goes_on_and_leaves_no_run_behind(tmp_pa
     learning = tmp_path / "s-0000" / "learning.jsonl"
     while not learning.exists() and search.poll() is None:
         time.sleep(0.1)
-    search.send_signal(signal.SIGINT)
+    search.send_signal(signal.SIGTERM)
     out, error = search.communicate(timeout=120)
     assert search.returncode == 130, error + out
     assert json.loads((tmp_path / "s-0000" / "report.json").read_text())["result"] == "interrupted"
@@ -201,3 +201,16 @@ def test_an_interrupted_or_killed_search_goes_on_and_leaves_no_run_behind(tmp_pa
     out, error = search.communicate(timeout=300)
     assert search.returncode == 0, error + out
     assert [row["state"] for row in trials(tmp_path)] == ["fail", "fail", "running", "fail", "running", "complete"]
+
+
+def test_a_run_ends_with_its_search(tmp_path: Path) -> None:
+    search = start(tmp_path, 1, run__real_time_factor=1)
+    while not (tmp_path / "s-0000" / "learning.jsonl").exists() and search.poll() is None:
+        time.sleep(0.1)
+    search.kill()
+    search.communicate(timeout=60)
+    report, begun = tmp_path / "s-0000" / "report.json", time.monotonic()
+    while not report.exists():
+        assert time.monotonic() - begun < 60
+        time.sleep(0.1)
+    assert json.loads(report.read_text())["result"] == "interrupted"

@@ -1,5 +1,6 @@
 """One trial: a run of `caraware train` that is watched while it learns, and stopped where it is not worth its time."""
 
+import ctypes
 import json
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from typing import Any
 POINTS = 20
 """Places of a run at which its live metric is compared with that of other trials."""
 POLL_S = 0.5
+PR_SET_PDEATHSIG = 1
 ENDING_S = 120.0
 """Longest time in which a run that was told to end does so."""
 CONFIG_STATUS = 2
@@ -38,8 +40,18 @@ class TrialRun:
     _process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> "TrialRun":
-        pipe = subprocess.PIPE
-        self._process = subprocess.Popen(self.command, stdout=subprocess.DEVNULL, stderr=pipe, text=True)
+        library = ctypes.CDLL(None)
+
+        def end_with_the_search() -> None:
+            library.prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+        self._process = subprocess.Popen(
+            self.command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=end_with_the_search,
+        )
         return self
 
     def __exit__(self, *_: object) -> None:

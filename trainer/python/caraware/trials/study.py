@@ -9,6 +9,7 @@ import argparse
 import json
 import math
 import os
+import signal
 import socket
 import sys
 import time
@@ -291,7 +292,7 @@ search and its run; the same command goes on. With the same --storage, machines 
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 once the trials are made, 1 where they fail, 2 for a wrong command, 130 after Ctrl-C."""
+    """0 once the trials are made, 1 where they fail, 2 for a wrong command, 130 after Ctrl-C or SIGTERM."""
     options = parser().parse_args(arguments)
     if options.trials < 1:
         parser().error("--trials: give at least 1")
@@ -313,6 +314,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     status = 0
+    # Clusters end jobs by SIGTERM, which a container's first process ignores without a handler.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         search.search(options.trials)
     except TrialFailed:
