@@ -23,7 +23,7 @@ STATES = {
     for page in newcomer.pages()
 }
 NEVER_RUN = {
-    "docs/cluster.md": 1,
+    "docs/cluster.md": 2,
     "docs/tutorials/many-machines.md": 1,
     "docs/tutorials/watch-from-a-laptop.md": 2,
     "docs/extending.md": 1,
