@@ -34,8 +34,8 @@ const DEADLINE: Duration = Duration::from_secs(300);
 const LONGEST_PAUSE_S: f64 = 1.5;
 /// Mean distance of two disturbances, seconds.
 const MEAN_S: f64 = 0.8;
-/// Time after which another disturbance is tried where the process of one was not there. A short run would end before its deck does
-/// if such a try cost as much as a disturbance.
+/// Time until the next disturbance where there was no process for one. If that took as long as a disturbance, a short run could end
+/// before all have been made.
 const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 /// A larger file of a run with faults is not kept.
 const MOST_KEPT_BYTES: u64 = 4 << 20;
@@ -428,7 +428,11 @@ impl<'a> DisturbedRun<'a> {
             self.handovers.push(client);
             return Ok(true);
         }
-        self.count_handover(client)
+        if !self.count_handover(client)? {
+            // It is asked for again after all other disturbances.
+            self.cards.insert(0, Disturbance::Handover);
+        }
+        Ok(true)
     }
 
     /// Waits for the end of a handover. Returns false if it was not made.
