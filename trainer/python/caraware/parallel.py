@@ -6,7 +6,6 @@ learns on all of them. With `--resume RUN` they continue from the newest checkpo
 """
 
 import argparse
-import ctypes
 import json
 import os
 import signal
@@ -17,9 +16,8 @@ from datetime import timedelta
 from pathlib import Path
 
 from caraware.run.manifest import NEWEST, sound_checkpoints
-from caraware.run.program import ProgramError, caraware_program
+from caraware.run.program import ProgramError, caraware_program, end_with_parent
 
-PR_SET_PDEATHSIG = 1
 WAIT_AT_MOST = timedelta(minutes=5)
 """For the names of the other ranks' checkpoints."""
 
@@ -129,7 +127,7 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     os.sched_setaffinity(0, place.cores(sorted(os.sched_getaffinity(0))))
     # Whatever ends torchrun ends its runs; what they started ends with them.
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent(signal.SIGTERM)
     os.environ.setdefault("CARAWARE_PYTHON", sys.executable)
     os.execv(program, [str(program), *words])
 

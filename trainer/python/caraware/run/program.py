@@ -1,9 +1,18 @@
 """Where the `caraware` command is, for what starts it from Python. It imports nothing but the standard library."""
 
+import ctypes
 import os
 import shutil
+import signal
 import sys
 from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent(number: signal.Signals) -> None:
+    """Make Linux send this process a signal once its parent has ended, however it ends. It outlives `exec`."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 class ProgramError(Exception):

@@ -1,31 +1,27 @@
 """One trial: a run of `caraware train` that is watched while it learns, and stopped where it is not worth its time."""
 
-import ctypes
 import json
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+from caraware.run.program import end_with_parent
 
 POINTS = 20
 """Places of a run at which its live metric is compared with that of other trials."""
 POLL_S = 0.5
-PR_SET_PDEATHSIG = 1
 ENDING_S = 120.0
 """Longest time in which a run that was told to end does so."""
-CONFIG_STATUS = 2
-"""Exit status of a wrong configuration: no other values of the varied keys would help."""
 
 
 class TrialFailed(Exception):
     """The run failed; the text says how."""
-
-    def __init__(self, text: str, status: int) -> None:
-        super().__init__(text)
-        self.is_configuration = status == CONFIG_STATUS
 
 
 @dataclass
@@ -37,28 +33,27 @@ class TrialRun:
     metric: str
     _read: int = 0
     _values: list[tuple[int, float]] = field(default_factory=list)
-    _process: subprocess.Popen[str] | None = None
+    _ticks_of_a_place: int = 0
+    """0 until the run has written its run file."""
+    _process: subprocess.Popen[bytes] | None = None
+    _ended: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> "TrialRun":
-        library = ctypes.CDLL(None)
-
-        def end_with_the_search() -> None:
-            library.prctl(PR_SET_PDEATHSIG, signal.SIGINT)
-
+        self._errors: IO[str] = self._ended.enter_context(tempfile.TemporaryFile("w+"))
         self._process = subprocess.Popen(
             self.command,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=end_with_the_search,
+            stderr=self._errors,
+            preexec_fn=lambda: end_with_parent(signal.SIGINT),
         )
+        self._ended.callback(self.stop)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        self._ended.close()
 
     @property
-    def process(self) -> subprocess.Popen[str]:
+    def process(self) -> subprocess.Popen[bytes]:
         """The supervisor of the run."""
         assert self._process is not None
         return self._process
@@ -72,8 +67,7 @@ class TrialRun:
         while self.process.poll() is None:
             time.sleep(POLL_S)
             beat()
-            length = self._ticks_of_a_place()
-            if length == 0:
+            if (length := self._place_length()) == 0:
                 continue
             self._read_on()
             newest = self._values[-1][0] // length if self._values else 0
@@ -84,13 +78,12 @@ class TrialRun:
 
     def final(self, value_of: Callable[[dict[str, Any]], float | None]) -> float:
         """What the report says, once the run has ended. Raises `TrialFailed`."""
-        assert self.process.stderr is not None
-        text, status = self.process.stderr.read().strip(), self.process.wait()
-        if status != 0:
-            raise TrialFailed(text or f"exit status {status}", status)
+        if (status := self.process.wait()) != 0:
+            self._errors.seek(0)
+            raise TrialFailed(self._errors.read().strip() or f"exit status {status}")
         value = value_of(json.loads((self.directory / "report.json").read_text()))
         if value is None:
-            raise TrialFailed(f"{self.directory / 'report.json'} has no {self.metric}", 1)
+            raise TrialFailed(f"{self.directory / 'report.json'} has no result of an evaluation")
         return value
 
     def stop(self) -> None:
@@ -103,13 +96,12 @@ class TrialRun:
                 self.process.kill()
                 self.process.wait()
 
-    def _ticks_of_a_place(self) -> int:
-        """0 until the run has written its run file."""
-        try:
-            episode = json.loads((self.directory / "run.json").read_text())["config"]["episode"]
-        except (OSError, ValueError):
-            return 0
-        return max(1, int(episode["ticks"]) * int(episode["training_episodes"]) // POINTS)
+    def _place_length(self) -> int:
+        run = self.directory / "run.json"
+        if self._ticks_of_a_place == 0 and run.exists():
+            episode = json.loads(run.read_text())["config"]["episode"]
+            self._ticks_of_a_place = max(1, int(episode["ticks"]) * int(episode["training_episodes"]) // POINTS)
+        return self._ticks_of_a_place
 
     def _read_on(self) -> None:
         """The lines of `learning.jsonl` since the last time."""

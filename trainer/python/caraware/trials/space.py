@@ -11,6 +11,8 @@ from typing import Any
 from optuna.trial import Trial
 
 LOGARITHMIC = ":log"
+NUMBERS = ("integer", "float")
+"""Kinds of keys that have ranges. In the values of others two dots are part of a path."""
 SYNTAX = "write KEY=LOW..HIGH, KEY=LOW..HIGH:log, or KEY=A,B,C"
 
 
@@ -33,10 +35,6 @@ class KeyRange:
             return str(trial.suggest_int(key, int(self.low), int(self.high), log=self.is_logarithmic))
         return repr(trial.suggest_float(key, self.low, self.high, log=self.is_logarithmic))
 
-    def ends(self) -> tuple[str, ...]:
-        """Values that must all be allowed."""
-        return (str(int(self.low)), str(int(self.high))) if self.is_integer else (repr(self.low), repr(self.high))
-
 
 @dataclass(frozen=True)
 class KeyChoices:
@@ -47,10 +45,6 @@ class KeyChoices:
     def suggest(self, trial: Trial, key: str) -> str:
         """The value of a trial."""
         return str(trial.suggest_categorical(key, self.values))
-
-    def ends(self) -> tuple[str, ...]:
-        """Values that must all be allowed."""
-        return self.values
 
 
 Space = dict[str, KeyRange | KeyChoices]
@@ -74,7 +68,8 @@ def parse_space(varied: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -
             raise SpaceError(f"--vary {text}: there is no key `{key}`; `caraware keys` lists them")
         if key in space:
             raise SpaceError(f"--vary {text}: `{key}` is varied twice")
-        space[key] = _range(text, values, known[key]) if ".." in values else _choices(text, values, known[key])
+        is_range = ".." in values and known[key]["kind"] in NUMBERS
+        space[key] = _range(text, values, known[key]) if is_range else _choices(text, values, known[key])
     if not space:
         raise SpaceError(f"nothing is varied: give --vary; {SYNTAX}")
     return space
@@ -107,13 +102,11 @@ def _split(values: str) -> list[str]:
 def _range(text: str, values: str, known: Mapping[str, Any]) -> KeyRange:
     is_logarithmic = values.endswith(LOGARITHMIC)
     ends = values.removesuffix(LOGARITHMIC).split("..")
-    kind = known["kind"]
-    if kind not in ("integer", "float"):
-        raise SpaceError(f"--vary {text}: the key is no number; write KEY=A,B,C")
+    is_integer = known["kind"] == "integer"
     try:
-        low, high = (float(int(end)) if kind == "integer" else float(end) for end in ends)
+        low, high = (float(int(end)) if is_integer else float(end) for end in ends)
     except ValueError:
-        number = "an integer" if kind == "integer" else "a number"
+        number = "an integer" if is_integer else "a number"
         raise SpaceError(f"--vary {text}: an end is not {number}; {SYNTAX}") from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise SpaceError(f"--vary {text}: the first end must be below the second")
@@ -122,4 +115,4 @@ def _range(text: str, values: str, known: Mapping[str, Any]) -> KeyRange:
     least, most = known["min"], known["max"]
     if (least is not None and low < least) or (most is not None and high > most):
         raise SpaceError(f"--vary {text}: allowed is {known['allowed']}")
-    return KeyRange(low, high, kind == "integer", is_logarithmic)
+    return KeyRange(low, high, is_integer, is_logarithmic)

@@ -10,11 +10,10 @@ import json
 import math
 import os
 import signal
-import socket
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,11 +36,9 @@ MOST_FAILURES = 3
 """Trials that fail one after the other before the study gives up."""
 BEAT_S, SILENT_S = 60.0, 900.0
 """A search says so often that its trial goes on; one of another machine that is silent for so long is dead."""
-HOST, PID, SEEN = "host", "pid", "seen"
+MACHINE, PROCESS, SEEN = "machine", "process", "seen"
+"""What a trial says of its search: see `machine` and `began`; when it was last alive, in seconds since 1970."""
 OVER = (TrialState.COMPLETE, TrialState.PRUNED)
-
-Value = Callable[[dict[str, Any]], float | None]
-"""What a report says of a metric."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +134,7 @@ class Search:
             except TrialFailed as error:
                 failures += 1
                 print(f"error: {error}", file=sys.stderr)
-                if error.is_configuration or failures == MOST_FAILURES:
+                if failures == MOST_FAILURES:
                     raise
 
     def _made(self) -> int:
@@ -147,11 +144,33 @@ class Search:
 
     def _try(self) -> None:
         trial = self._study.ask()
+        try:
+            value = self._run(trial)
+        except BaseException:
+            self._study.tell(trial, state=TrialState.FAIL)
+            raise
+        if value is None:
+            self._study.tell(trial, state=TrialState.PRUNED)
+            return
+        self._study.tell(trial, value)
+        best = self._study.best_trial
+        print(
+            f"trial {trial.number}: {self._goal.name} {value:.4g}; best {best.value:.4g} of trial {best.number}",
+            flush=True,
+        )
+
+    def _run(self, trial: optuna.Trial) -> float | None:
+        """What the run of a trial has reached, or None where it was stopped. Raises `TrialFailed`."""
+        trial.set_user_attr(MACHINE, machine())
+        trial.set_user_attr(PROCESS, [os.getpid(), began(os.getpid())])
         # What a trial draws depends on the seed, its number and those before it: machines do not repeat each other.
         self._study.sampler = optuna.samplers.TPESampler(seed=(self._seed * 1_000_003 + trial.number) % 2**32)
         values = {key: varied.suggest(trial, key) for key, varied in self._space.items()}
-        trial.set_user_attr(HOST, socket.gethostname())
-        trial.set_user_attr(PID, os.getpid())
+        name = self._place.run(trial.number)
+        command = [*self._command, "--name", name, "--runs", str(self._place.runs)]
+        for key, text in values.items():
+            command += ["--set", f"{key}={text}"]
+        print(f"trial {trial.number}: {' '.join(f'{key}={text}' for key, text in values.items())}", flush=True)
         beaten = time.monotonic()
 
         def beat() -> None:
@@ -160,30 +179,13 @@ class Search:
                 trial.set_user_attr(SEEN, time.time())
                 beaten = time.monotonic()
 
-        name = self._place.run(trial.number)
-        command = [*self._command, "--name", name, "--runs", str(self._place.runs)]
-        for key, text in values.items():
-            command += ["--set", f"{key}={text}"]
-        print(f"trial {trial.number}: {' '.join(f'{key}={text}' for key, text in values.items())}", flush=True)
-        try:
-            with TrialRun(command, self._place.runs / name, self._goal.live) as run:
-                for place, value in run.points(beat):
-                    trial.report(value, place)
-                    if trial.should_prune():
-                        run.stop()
-                        self._study.tell(trial, state=TrialState.PRUNED)
-                        print(f"trial {trial.number}: stopped at {self._goal.live} {value:.4g}", flush=True)
-                        return
-                value = run.final(self._goal.of_report)
-        except BaseException:
-            self._study.tell(trial, state=TrialState.FAIL)
-            raise
-        self._study.tell(trial, value)
-        best = self._study.best_trial
-        print(
-            f"trial {trial.number}: {self._goal.name} {value:.4g}; best {best.value:.4g} of trial {best.number}",
-            flush=True,
-        )
+        with TrialRun(command, self._place.runs / name, self._goal.live) as run:
+            for place, value in run.points(beat):
+                trial.report(value, place)
+                if trial.should_prune():
+                    print(f"trial {trial.number}: stopped at {self._goal.live} {value:.4g}", flush=True)
+                    return None
+            return run.final(self._goal.of_report)
 
     def _refuse_another_study(self, what: str) -> None:
         """Trials of different commands would be compared with each other. Raises `SpaceError`."""
@@ -203,21 +205,27 @@ class Search:
                 self._study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
 
+def machine() -> str:
+    """Where a process id means the same process: this start of the kernel, and this container."""
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+
+
+def began(pid: int) -> int | None:
+    """When a process began, in ticks of the kernel, or None without it: ids are given again, in containers soon."""
+    try:
+        # Field 22 of proc_pid_stat(5). The second is a name in brackets, which may hold anything.
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+
+
 def _goes_on(trial: FrozenTrial) -> bool:
-    if trial.user_attrs.get(HOST) == socket.gethostname() and PID in trial.user_attrs:
-        return _is_alive(trial.user_attrs[PID])
+    if trial.user_attrs.get(MACHINE) == machine() and PROCESS in trial.user_attrs:
+        pid, since = trial.user_attrs[PROCESS]
+        return bool(began(pid) == since)
     begun = trial.datetime_start.timestamp() if trial.datetime_start else 0.0
     return time.time() - float(trial.user_attrs.get(SEEN, begun)) < SILENT_S
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def write_results(search: Search, place: StudyPlace, goal: Goal) -> None:
