@@ -21,6 +21,15 @@ def pytest_configure() -> None:
         sys.dont_write_bytecode = False
 
 
+@pytest.fixture(scope="session", autouse=True)
+def logs_of_libraries(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Stable-Baselines3 and `torchrun` make a directory for logs at every start, and leave it: pytest removes these."""
+    with pytest.MonkeyPatch.context() as patch:
+        for variable in ("SB3_LOGDIR", "PET_LOG_DIR"):
+            patch.setenv(variable, str(tmp_path_factory.mktemp("logs")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def askew_run() -> Iterator[Path]:
     """A recorded run of three carriers with sensors that are mounted off-centre and turned."""
