@@ -280,8 +280,8 @@ class Shell:
 def clean_environment(directory: Path) -> dict[str, str]:
     """The variables of a new terminal: no environment is active, and no directory of PATH has `caraware`.
 
-    The page has a registry of its own, so that live runs of the same names elsewhere on the machine are not meant. So has
-    it a directory for the logs that Stable-Baselines3 and `torchrun` make at every start, and leave.
+    The page has a registry of its own, so that live runs of the same names elsewhere on the machine are not meant. It
+    also has a directory for the logs that Stable-Baselines3 and `torchrun` make at every start, and leave.
     """
     variables = {key: value for key, value in os.environ.items() if key not in ("VIRTUAL_ENV", "PYTHONPATH")}
     variables["CARAWARE_RUNTIME_DIR"] = str(directory / ".registry")
