@@ -28,12 +28,13 @@ const LONG_M: f64 = 500.0;
 /// Normal quantile of a two-sided 95 % interval.
 const Z95: f64 = 1.959_964;
 /// The ends in the order of the columns.
-const ENDS: [&str; 7] = [
+const ENDS: [&str; 8] = [
     "arrival",
     "collision",
     "off-road",
     "red light",
     "against traffic",
+    "blocked",
     "time limit",
     "end of the run's episode",
 ];

@@ -318,6 +318,8 @@ pub struct TaskConfig {
     pub action: LocalisationAction,
     /// Longest episode of a hero, seconds.
     pub time_limit_s: f64,
+    /// A hero that stands for so long is blocked, and its episode ends, seconds; `None` for never.
+    pub blocked_s: Option<f64>,
     /// What moves the heroes.
     pub driver: HeroDriver,
     /// A hero's episode ends at a red light and when it drives against the traffic.

@@ -47,6 +47,8 @@ pub const ENDED_AT_RED: u32 = 1 << 8;
 pub const ENDED_AGAINST_TRAFFIC: u32 = 1 << 9;
 /// Beside [`TRUNCATED`]: the hero's time limit. Without it, the run's episode ended.
 pub const ENDED_BY_TIME: u32 = 1 << 10;
+/// Beside [`TERMINATED`]: the hero stood for too long.
+pub const ENDED_BLOCKED: u32 = 1 << 11;
 
 /// The bits of a slot's end for a hero's bits of [`crate::world::HERO_ENDS`].
 #[must_use]
@@ -58,6 +60,7 @@ pub const fn end_bits(hero_ends: u32) -> u32 {
         (world::ARRIVED, ENDED_BY_ARRIVAL),
         (world::RED_LIGHT, ENDED_AT_RED),
         (world::AGAINST_TRAFFIC, ENDED_AGAINST_TRAFFIC),
+        (world::BLOCKED, ENDED_BLOCKED),
         (world::TIME_LIMIT, ENDED_BY_TIME),
     ];
     let mut place = 0;

@@ -25,6 +25,8 @@ pub const RED_LIGHT: u32 = 1 << 7;
 pub const AGAINST_TRAFFIC: u32 = 1 << 8;
 /// It is led along its path as if on rails, because no driving would keep it there.
 pub const GUIDED: u32 = 1 << 9;
+/// Bit of [`VehicleState::flags`]: the hero has stood for `task.blocked_s`, and its trajectory ends.
+pub const BLOCKED: u32 = 1 << 10;
 
 /// Place of the first bit that names a suite of [`crate::config::Config::suites`]: that of suite *n* is set if class, type, id and share
 /// let the vehicle carry it. Bits of flags are below.
@@ -80,7 +82,7 @@ pub struct VehicleState {
     /// SUMO's signal bits.
     pub signals: u32,
     /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`],
-    /// [`RED_LIGHT`], [`AGAINST_TRAFFIC`], [`GUIDED`], and from [`SUITES_SHIFT`] on the suites that it may carry.
+    /// [`RED_LIGHT`], [`AGAINST_TRAFFIC`], [`GUIDED`], [`BLOCKED`], and from [`SUITES_SHIFT`] on the suites that it may carry.
     pub flags: u32,
     /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
     pub reference_offset_m: f32,
@@ -122,7 +124,7 @@ pub struct SubStep {
 }
 
 /// Bits that end a hero's episode; [`TIME_LIMIT`] alone cuts it, the others terminate it.
-pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT | RED_LIGHT | AGAINST_TRAFFIC;
+pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT | RED_LIGHT | AGAINST_TRAFFIC | BLOCKED;
 
 /// Distances ahead, along the route, of the route points that a hero sees, metres.
 pub const ROUTE_AHEAD_M: [f64; 4] = [5.0, 10.0, 20.0, 40.0];

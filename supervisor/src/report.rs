@@ -403,11 +403,12 @@ fn summary(report: &Value, path: &Path) -> String {
     let heroes = &report["dynamics"]["heroes"];
     if !heroes.is_null() {
         lines.push(format!(
-            "heroes: {} episodes, of which {} arrived, {} collided, {} left the road, {} ran out of time; {} actions refused",
+            "heroes: {} episodes, of which {} arrived, {} collided, {} left the road, {} blocked, {} ran out of time; {} actions refused",
             heroes["episodes"],
             heroes["arrived"],
             heroes["collided"],
             heroes["off_road"],
+            heroes["blocked"],
             heroes["time_limit"],
             heroes["refused_actions"]
         ));

@@ -864,6 +864,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("ENDED_BY_ARRIVAL", ipc_schema::observation::ENDED_BY_ARRIVAL)?;
     module.add("ENDED_AT_RED", ipc_schema::observation::ENDED_AT_RED)?;
     module.add("ENDED_AGAINST_TRAFFIC", ipc_schema::observation::ENDED_AGAINST_TRAFFIC)?;
+    module.add("ENDED_BLOCKED", ipc_schema::observation::ENDED_BLOCKED)?;
     module.add("ENDED_BY_TIME", ipc_schema::observation::ENDED_BY_TIME)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
     module.add("RESYNCHRONISED", ipc_schema::observation::RESYNCHRONISED)?;

@@ -117,9 +117,10 @@ def test_an_evaluation_takes_the_mean_and_draws_nothing() -> None:
     assert answer[:2].equal(ppo.task.answer(ppo.updater.mean(obs.observation))[:2])
 
 
-def test_a_batch_holds_what_was_drawn_and_what_followed() -> None:
+@pytest.mark.parametrize("end", [ends.COLLISION, ends.BLOCKED])
+def test_a_batch_holds_what_was_drawn_and_what_followed(end: int) -> None:
     ppo = learner(**SETTINGS)
-    why = np.array([ends.COLLISION, 0, 0], np.uint32)
+    why = np.array([end, 0, 0], np.uint32)
     ticks = [hero_tick(n) for n in range(3)]
     ticks.append(hero_tick(3, terminated=np.array([True, False, False]), why=why))
     ticks[3].vehicle[0] = 7
@@ -132,12 +133,12 @@ def test_a_batch_holds_what_was_drawn_and_what_followed() -> None:
     # The log-probability is that of the action under the policy that drew it, clipped or not.
     mean = ppo.updater.mean(batch.observation)
     assert torch.allclose(batch.log_probability, log_probability(batch.action, mean, ppo.updater.log_std), atol=1e-5)
-    # 1 m of progress at 10 m/s pays 0.1 m in tens; the tick of the collision costs 10 and ends its chain.
+    # 1 m of progress at 10 m/s pays 0.1 m in tens; the tick of the failure costs 10 and ends its chain.
     reward = torch.zeros(5, 2).index_put_((batch.tick, batch.vehicle.clamp(max=1) * (batch.vehicle < 7)), batch.reward)
     assert reward[:, 1].tolist() == pytest.approx([0.1] * 5, abs=1e-3)
     assert reward[:, 0].tolist() == pytest.approx([0.1, 0.1, -10.0, 0.1, 0.1], abs=1e-3)
     at_end = (batch.tick == 2) & (batch.vehicle == 0)
-    assert batch.value_target[at_end].item() == pytest.approx(-10.0, abs=1e-4), "nothing follows a collision"
+    assert batch.value_target[at_end].item() == pytest.approx(-10.0, abs=1e-4), "nothing follows a failure"
     # Two ticks before, by hand: r + γV' − V, chained by γλ.
     value = ppo.updater.value(batch.observation)
     of = {(int(t), int(v)): i for i, (t, v) in enumerate(zip(batch.tick, batch.vehicle, strict=True))}

@@ -12,6 +12,7 @@ from caraware.driving.imitate import Teacher, clone
 from caraware.driving.lessons import Lessons, Limits
 from caraware.driving.manoeuvres import BETWEEN, NEEDED, Manoeuvres
 from caraware.driving.trips import TripLog
+from caraware.ipc.channel import ENDED_BY
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.config import TrainerConfig
 from caraware.learn.encoders import EGO, FIELDS, GROUPS, GroupedNetwork
@@ -20,7 +21,8 @@ from caraware.learn.ppo import PlainUpdate
 from caraware.run.learner import begin_from
 from caraware.run.manifest import CheckpointError
 from caraware.tasks import ends
-from caraware.tasks.driving import Driving
+from caraware.tasks.driving import ENDS, Driving
+from caraware.tasks.ends import name_of
 from caraware.tasks.fields import Fields
 from safetensors.torch import save_file
 from synthetic import run_file
@@ -207,6 +209,15 @@ def trip_log() -> TripLog:
     run["config"]["traffic"] |= {"heroes": 2, "cavs": 0, "others": 0, "pedestrians": 0}
     run["config"]["trainer"] = run_file("/tmp")["config"]["trainer"]
     return TripLog(run, Driving.from_run(run))
+
+
+def test_every_end_that_the_flags_tell_has_a_name_that_the_task_lists() -> None:
+    bits = 0
+    for bit, name in ends.END_NAMES.items():
+        assert bits & bit == 0 and name_of(bit) == name
+        bits |= bit
+    assert bits == int(ENDED_BY)
+    assert {*ends.END_NAMES.values(), ends.RUN_ENDED} == {end.name for end in ENDS}
 
 
 def test_a_trip_is_that_of_a_hero_of_the_list_and_counts_once() -> None:

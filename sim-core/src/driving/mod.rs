@@ -7,8 +7,8 @@ use ipc_schema::{
     ego::EgoPose,
     traffic::{Kind, RoutePoint, SIGNAL_LINKS, SignalMeta},
     world::{
-        ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD, RED_LIGHT,
-        ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState,
+        ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, BLOCKED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD,
+        RED_LIGHT, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState,
     },
 };
 
@@ -28,6 +28,8 @@ const OFF_ROAD_AFTER_S: f64 = 0.5;
 const AGAINST_TRAFFIC_AFTER_S: f64 = 1.0;
 /// Speed from which a hero drives against the traffic, m/s.
 const AGAINST_TRAFFIC_FROM_MPS: f32 = 0.5;
+/// A slower hero stands, m/s.
+const STANDS_MPS: f32 = 0.1;
 /// A hero has arrived when its front bumper is this near to the end of its route, metres.
 const ARRIVED_WITHIN_M: f64 = 5.0;
 /// Part of the route behind and ahead of its last position that is searched for a hero, metres.
@@ -67,6 +69,8 @@ pub struct HeroCounts {
     pub off_road: u64,
     /// Ended at the end of the route.
     pub arrived: u64,
+    /// Ended because they stood for too long.
+    pub blocked: u64,
     /// Cut by the time limit.
     pub time_limit: u64,
     /// Red lights run, whether or not the episode ends there.
@@ -103,6 +107,8 @@ struct HeroTrip {
     /// Station of the front bumper at the last tick, metres.
     front_station_m: Option<f64>,
     ticks: u64,
+    /// Since it moved last.
+    standing_ticks: u64,
     over: bool,
 }
 
@@ -115,6 +121,8 @@ pub struct DrivingTask<G> {
     against_ticks: u32,
     ends_at_infractions: bool,
     time_limit_ticks: u64,
+    /// `None`: no hero is ever blocked.
+    blocked_ticks: Option<u64>,
     episode: Option<u64>,
     trips: BTreeMap<u32, HeroTrip>,
     /// Letters of each traffic light's links.
@@ -134,6 +142,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             against_ticks: ticks(AGAINST_TRAFFIC_AFTER_S) as u32,
             ends_at_infractions: config.task.ends_at_infractions,
             time_limit_ticks: ticks(config.task.time_limit_s) as u64,
+            blocked_ticks: config.task.blocked_s.map(|seconds| ticks(seconds) as u64),
             episode: None,
             trips: BTreeMap::new(),
             signals: BTreeMap::new(),
@@ -260,6 +269,8 @@ impl<G: DrivableGround> DrivingTask<G> {
         });
         trip.off_road_ticks = if on_road { 0 } else { trip.off_road_ticks + 1 };
         trip.ticks += 1;
+        let stands = state.velocity_body_mps[0] < STANDS_MPS;
+        trip.standing_ticks = if stands { trip.standing_ticks + 1 } else { 0 };
         let has_route = trip.route.length_m() > 0.0;
         let refused = if std::mem::take(&mut trip.refused) {
             ACTION_REFUSED
@@ -269,6 +280,10 @@ impl<G: DrivableGround> DrivingTask<G> {
         let mut flags = refused | infractions;
         for (bit, holds) in [
             (OFF_ROAD, trip.off_road_ticks >= self.off_road_ticks),
+            (
+                BLOCKED,
+                self.blocked_ticks.is_some_and(|limit| trip.standing_ticks >= limit),
+            ),
             (ARRIVED, has_route && f64::from(view.route_left_m) <= ARRIVED_WITHIN_M),
         ] {
             flags |= if holds { bit } else { 0 };
@@ -282,6 +297,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             counts.collided += u64::from(ends & COLLIDED != 0);
             counts.off_road += u64::from(ends & OFF_ROAD != 0);
             counts.arrived += u64::from(ends & ARRIVED != 0);
+            counts.blocked += u64::from(ends & BLOCKED != 0);
             counts.time_limit += u64::from(ends & TIME_LIMIT != 0);
         }
         flags

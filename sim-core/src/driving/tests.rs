@@ -108,6 +108,25 @@ fn a_hero_sees_its_route_what_is_on_it_and_the_signal() {
 }
 
 #[test]
+fn a_hero_that_stands_for_too_long_is_blocked_and_one_that_creeps_on_in_between_is_not() {
+    let flags_of = |blocked_s: Option<f64>, speeds_mps: &[f32]| -> Vec<u32> {
+        let mut config = config();
+        config.task.blocked_s = blocked_s;
+        let mut driving = DrivingTask::new(&config, Strip);
+        driving.enter_episode(0);
+        let mut stand = |speed_mps| {
+            let mut hero = car(3, Kind::Hero, 10.0, 0.0);
+            hero.velocity_body_mps[0] = speed_mps;
+            tick(&mut driving, &mut [hero]).1.flags
+        };
+        speeds_mps.iter().map(|&speed_mps| stand(speed_mps)).collect()
+    };
+    assert_eq!(flags_of(Some(0.4), &[0.0, 0.05, 0.0, 0.0]), [0, 0, 0, BLOCKED]);
+    assert_eq!(flags_of(Some(0.4), &[0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0]), [0; 7]);
+    assert_eq!(flags_of(None, &[0.0; 12]), [0; 12]);
+}
+
+#[test]
 fn off_the_road_for_half_a_second_arrival_and_time_end_the_episode_each_with_its_flag() {
     let mut off = driving();
     let flags: Vec<u32> = (0..5)

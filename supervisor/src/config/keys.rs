@@ -276,6 +276,7 @@ pub const KEYS: &[ConfigKey] = &[
     other("task.kind", ValueKind::Choice(&["localisation", "driving", "lane"]), "Meaning of the trainer's output: a position for every connected vehicle; steering and acceleration for every hero; or the lane and the lateral position in it of every connected vehicle (docs/seeing.md)."),
     other("task.action", ValueKind::Choice(&["place", "correction"]), "What an action of the localisation task names: a place in the box of the map, as in the paper, or a correction of the newest fix. `caraware train SCENARIO` corrects, unless it is set."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),
+    optional("task.blocked_s", "s", 0.1, 1e6, "A hero that stands for so long is blocked: its trajectory is terminated. Unset = never."),
     other("task.driver", ValueKind::Choice(&["actions", "sumo"]), "What moves the heroes: the trainer's actions, or SUMO's own driver, which the trainer then only watches (docs/driving.md)."),
     other("task.ends_at_infractions", ValueKind::Flag, "A red light that a hero runs, and a second of driving against the traffic, end its episode; otherwise they are only counted."),
     other("task.reward", ValueKind::Text, "Reward of the driving task: \"\" for its own, or a Python function \"package.module:function\" (docs/driving.md)."),

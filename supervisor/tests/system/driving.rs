@@ -252,25 +252,23 @@ fn seen(report: &Value) -> Vec<Vec<Value>> {
 }
 
 #[test]
-fn leaving_the_road_terminates_and_the_time_limit_truncates() {
+fn leaving_the_road_and_standing_terminate_and_the_time_limit_truncates() {
     let workplace = Workplace::new();
-    let ends = |name: &str, script: &str| {
+    let ends = |name: &str, script: &str, more: &[&str]| {
         let settings = ["--set", "episode.ticks=200", "--set", "task.time_limit_s=6"];
-        succeed(in_town(&workplace, name, script, &settings));
+        succeed(in_town(&workplace, name, script, &[&settings, more].concat()));
         workplace.report(name)
     };
     // This hero drives straight out of the bend and over the kerb: it is beside the road long before the time limit.
-    let off = ends("off", r#"{"0": [1, 1]}"#);
-    let cut = ends("cut", r#"{"0": [0, -1]}"#);
-    for (report, key, column) in [(&off, "off_road", 5), (&cut, "time_limit", 6)] {
+    let off = ends("off", r#"{"0": [1, 1]}"#, &[]);
+    let cut = ends("cut", r#"{"0": [0, -1]}"#, &[]);
+    let stood = ends("stood", r#"{"0": [0, -1]}"#, &["--set", "task.blocked_s=1.5"]);
+    for (report, key, column) in [(&off, "off_road", 5), (&cut, "time_limit", 6), (&stood, "blocked", 5)] {
         let heroes = &report["dynamics"]["heroes"];
         let count = heroes[key].as_u64().unwrap();
         assert!(count >= 2, "{heroes}");
-        assert_eq!(
-            heroes["off_road"].as_u64().unwrap() + heroes["time_limit"].as_u64().unwrap(),
-            count,
-            "{heroes}"
-        );
+        let of_all = ["off_road", "time_limit", "blocked"].map(|end| heroes[end].as_u64().unwrap());
+        assert_eq!(of_all.iter().sum::<u64>(), count, "{heroes}");
         let rows: Vec<_> = seen(report).into_iter().filter(|row| row[0] == 0).collect();
         let flagged: Vec<usize> = (0..rows.len())
             .filter(|&at| rows[at][5] == true || rows[at][6] == true)

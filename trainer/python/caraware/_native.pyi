@@ -17,6 +17,7 @@ __all__ = [
     "EMPTY_SLOT",
     "ENDED_AGAINST_TRAFFIC",
     "ENDED_AT_RED",
+    "ENDED_BLOCKED",
     "ENDED_BY_ARRIVAL",
     "ENDED_BY_COLLISION",
     "ENDED_BY_TIME",
@@ -66,6 +67,7 @@ ENDED_OFF_ROAD: int
 ENDED_BY_ARRIVAL: int
 ENDED_AT_RED: int
 ENDED_AGAINST_TRAFFIC: int
+ENDED_BLOCKED: int
 ENDED_BY_TIME: int
 """Bit of `flags`: the trajectory that held the slot a tick before was cut there."""
 CLIPPED: int

@@ -37,6 +37,7 @@ ENDED_BY = np.uint32(
     | _native.ENDED_BY_ARRIVAL
     | _native.ENDED_AT_RED
     | _native.ENDED_AGAINST_TRAFFIC
+    | _native.ENDED_BLOCKED
     | _native.ENDED_BY_TIME
 )
 """All bits of an observation's flags that say why a hero's trajectory ended."""

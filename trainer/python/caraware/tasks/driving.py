@@ -50,6 +50,7 @@ ENDS = (
     EndReason("off-road", EndKind.TERMINATED),
     EndReason("red light", EndKind.TERMINATED),
     EndReason("against traffic", EndKind.TERMINATED),
+    EndReason("blocked", EndKind.TERMINATED),
     EndReason("arrival", EndKind.TERMINATED),
     EndReason("time limit", EndKind.TRUNCATED),
     EndReason("end of the run's episode", EndKind.TRUNCATED),
@@ -74,7 +75,7 @@ class DrivenStep:
     """To the left, mean over the tick."""
     arrived: Tensor
     failed: Tensor
-    """Ended by a collision, beside the road, at a red light, or against the traffic."""
+    """Ended by a collision, beside the road, at a red light, against the traffic, or because it stood too long."""
     ended: Tensor
     """Its last tick, for any reason: the action was not used."""
     ended_by: Tensor
@@ -169,7 +170,7 @@ class Driving:
             why = torch.where(outcome.terminated, why, 0)
         arrived = outcome.terminated & ((why & ends.ARRIVAL) != 0)
         failed = outcome.terminated & ((why & (ends.COLLISION | ends.OFF_ROAD)) != 0)
-        failed |= outcome.terminated & ((why & (ends.RED_LIGHT | ends.AGAINST_TRAFFIC)) != 0)
+        failed |= outcome.terminated & ((why & (ends.RED_LIGHT | ends.AGAINST_TRAFFIC | ends.BLOCKED)) != 0)
         return DrivenStep(
             progress_m=self._progress_m(step, outcome),
             offset_m=self._field(outcome.next.observation, "route_offset", 0.0).abs(),

@@ -9,6 +9,7 @@ OFF_ROAD = _native.ENDED_OFF_ROAD
 RED_LIGHT = _native.ENDED_AT_RED
 AGAINST_TRAFFIC = _native.ENDED_AGAINST_TRAFFIC
 ARRIVAL = _native.ENDED_BY_ARRIVAL
+BLOCKED = _native.ENDED_BLOCKED
 TIME_LIMIT = _native.ENDED_BY_TIME
 
 END_NAMES: Mapping[int, str] = {
@@ -17,6 +18,7 @@ END_NAMES: Mapping[int, str] = {
     RED_LIGHT: "red light",
     AGAINST_TRAFFIC: "against traffic",
     ARRIVAL: "arrival",
+    BLOCKED: "blocked",
     TIME_LIMIT: "time limit",
 }
 """By bit. Where a trip ends for two reasons at once, the first counts."""
