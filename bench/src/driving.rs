@@ -364,16 +364,17 @@ mod tests {
             trip("arrival", false),
             trip("collision", false),
             trip("collision", true),
+            trip("blocked", false),
             trip("time limit", false),
         ];
         let cells = row(&driver(), &trips);
-        assert_eq!(cells[1..3], ["4", "25.0 %"]);
-        assert_eq!(cells[4..10], ["2", "0", "0", "0", "1", "0"]);
-        // Two collisions in 2 km, one of them at fault, 2 km in 200 s.
-        assert_eq!(cells[10..], ["1000", "500", "10.0"]);
+        assert_eq!(cells[1..3], ["5", "20.0 %"]);
+        assert_eq!(cells[4..11], ["2", "0", "0", "0", "1", "1", "0"]);
+        // Two collisions in 2.5 km, one of them at fault, 2.5 km in 250 s.
+        assert_eq!(cells[11..], ["800", "400", "10.0"]);
         assert_eq!(
             manoeuvre_rows(&driver(), &trips),
-            [["d", "left turn, yielding", "8", "2", "1"]]
+            [["d", "left turn, yielding", "10", "2", "1"]]
         );
     }
 
