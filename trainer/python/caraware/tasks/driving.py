@@ -169,8 +169,7 @@ class Driving:
             why = torch.where(self._at_the_end(step.observation), ends.ARRIVAL, ends.COLLISION)
             why = torch.where(outcome.terminated, why, 0)
         arrived = outcome.terminated & ((why & ends.ARRIVAL) != 0)
-        failed = outcome.terminated & ((why & (ends.COLLISION | ends.OFF_ROAD)) != 0)
-        failed |= outcome.terminated & ((why & (ends.RED_LIGHT | ends.AGAINST_TRAFFIC | ends.BLOCKED)) != 0)
+        failed = outcome.terminated & ((why & ends.FAILURES) != 0)
         return DrivenStep(
             progress_m=self._progress_m(step, outcome),
             offset_m=self._field(outcome.next.observation, "route_offset", 0.0).abs(),

@@ -22,6 +22,8 @@ END_NAMES: Mapping[int, str] = {
     TIME_LIMIT: "time limit",
 }
 """By bit. Where a trip ends for two reasons at once, the first counts."""
+FAILURES = sum(bit for bit in END_NAMES if bit not in (ARRIVAL, TIME_LIMIT))
+"""The bits of ends that are the driver's failure."""
 RUN_ENDED = "end of the run's episode"
 """An end without a bit."""
 
