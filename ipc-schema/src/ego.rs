@@ -20,7 +20,7 @@ pub struct EgoPose {
     pub accel_mps2: f64,
     /// Dense index within the episode.
     pub vehicle: u32,
-    /// Bits of [`crate::world`] that end the hero's episode: `COLLIDED`, `OFF_ROAD`, `ARRIVED`, `TIME_LIMIT`; 0 while it lasts.
+    /// Bits of [`crate::world::HERO_ENDS`] that end the hero's episode; 0 while it lasts.
     pub flags: u32,
 }
 

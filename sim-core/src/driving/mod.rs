@@ -70,6 +70,7 @@ pub struct HeroCounts {
     /// Ended at the end of the route.
     pub arrived: u64,
     /// Ended because they stood for too long.
+    #[serde(default)]
     pub blocked: u64,
     /// Cut by the time limit.
     pub time_limit: u64,
