@@ -58,6 +58,7 @@ NAVIGATION = {
         "docs/baselines",
         "docs/fusion",
         "docs/cooperation",
+        "docs/messages",
         "docs/curriculum",
         "docs/parallel",
         "docs/trials",

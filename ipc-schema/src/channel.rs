@@ -279,7 +279,8 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         sections: PredictionLayout::SECTIONS,
         dimensions: PredictionLayout::DIMENSIONS,
         producer: Trainer,
-        // In the driving task sim-core waits for each message, so the trainer is at most one ahead and no queue overflows.
+        // Where the world waits for actions, sim-core or v2x waits for each message: the trainer is at most one ahead, and no queue
+        // overflows.
         required: &[],
         paced_by: Channel::Observation,
         window: RunFile::window_ticks,
@@ -441,7 +442,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         topics: &[],
         when_full: FullQueue::DropNewest,
         max_payload: |run| match run.config.v2x.is_on() {
-            true => NeighboursLayout::sized(road_users(run), run.config.v2x.neighbours as usize).len,
+            true => NeighboursLayout::of_config(&run.config, road_users(run)).len,
             false => 0,
         },
         queue_length: windowful,

@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::{neighbours, process::Process};
+
 mod camera;
 mod curriculum;
 mod fanout;
@@ -104,7 +106,7 @@ impl Config {
     #[must_use]
     pub fn heroes(&self) -> usize {
         match self.task.kind {
-            TaskKind::Localisation | TaskKind::Lane => 0,
+            TaskKind::Localisation | TaskKind::Lane | TaskKind::Messages => 0,
             TaskKind::Driving => self.traffic.heroes as usize + self.traffic.hero_ids.len(),
         }
     }
@@ -115,6 +117,15 @@ impl Config {
         match self.road.surface {
             Surface::Dry if self.weather.rain_mmph > 0.0 => Surface::Wet,
             surface => surface,
+        }
+    }
+
+    /// Numbers in a row that a policy sees: of the observation, or in the messages task of `speech`.
+    #[must_use]
+    pub fn policy_width(&self) -> usize {
+        match self.speaks() {
+            true => neighbours::speech_width(self.v2x.candidates as usize),
+            false => self.observation_width(),
         }
     }
 
@@ -139,6 +150,28 @@ impl Config {
     #[must_use]
     pub fn drives(&self) -> bool {
         self.task.kind == TaskKind::Driving
+    }
+
+    /// True if the task is what messages list, so that `v2x` sends what a policy sees and what messages achieve.
+    #[must_use]
+    pub fn speaks(&self) -> bool {
+        self.task.kind == TaskKind::Messages
+    }
+
+    /// The process that waits for the trainer's actions at every tick; `None` where the world does not depend on them.
+    #[must_use]
+    pub fn actor(&self) -> Option<Process> {
+        match self.task.kind {
+            TaskKind::Driving => Some(Process::SimCore),
+            TaskKind::Messages if self.v2x.inclusion == V2xInclusion::Policy => Some(Process::V2x),
+            TaskKind::Messages | TaskKind::Localisation | TaskKind::Lane => None,
+        }
+    }
+
+    /// True if a tick waits for the trainer's actions.
+    #[must_use]
+    pub fn awaits_actions(&self) -> bool {
+        self.actor().is_some()
     }
 }
 
@@ -284,6 +317,8 @@ pub enum TaskKind {
     Driving,
     /// Lane and lateral position in it of every connected vehicle; the world does not listen.
     Lane,
+    /// Which of the objects that it perceives each connected vehicle tells others of.
+    Messages,
 }
 
 impl TaskKind {
@@ -294,6 +329,7 @@ impl TaskKind {
             Self::Localisation => "localisation",
             Self::Driving => "driving",
             Self::Lane => "lane",
+            Self::Messages => "messages",
         }
     }
 }
@@ -324,6 +360,8 @@ pub struct TaskConfig {
     pub driver: HeroDriver,
     /// A hero's episode ends at a red light and when it drives against the traffic.
     pub ends_at_infractions: bool,
+    /// Messages task: what a kilobyte of collective perception messages costs, in seconds for which others newly know an object.
+    pub message_cost: f64,
     /// Reward: "" for the task's own, or "package.module:function".
     pub reward: String,
     /// Checkpoint or file of parameters from which a new policy begins; "" for none.

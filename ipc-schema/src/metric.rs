@@ -102,7 +102,7 @@ impl From<PolicyMetric> for &'static str {
 }
 
 /// Every metric, in the order of [`MetricValues`]. The first metric of a task is its headline.
-pub const METRICS: [MetricSpec; 8] = [
+pub const METRICS: [MetricSpec; 10] = [
     MetricSpec {
         name: "error_m",
         label: "error",
@@ -167,10 +167,26 @@ pub const METRICS: [MetricSpec; 8] = [
         task: TaskKind::Lane,
         reference_for: Some("wrong_lane_percent"),
     },
+    MetricSpec {
+        name: "awareness_percent",
+        label: "awareness",
+        unit: "%",
+        direction: MetricDirection::HigherIsBetter,
+        task: TaskKind::Messages,
+        reference_for: None,
+    },
+    MetricSpec {
+        name: "message_kbitps",
+        label: "messages",
+        unit: "kbit/s",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Messages,
+        reference_for: None,
+    },
 ];
 
 /// Number of metrics that a board has room for.
-pub const METRIC_CAPACITY: usize = 8;
+pub const METRIC_CAPACITY: usize = 12;
 const _: () = assert!(
     METRICS.len() <= METRIC_CAPACITY,
     "a board has room for METRIC_CAPACITY metrics"
@@ -214,6 +230,7 @@ pub fn headline(task: TaskKind) -> &'static MetricSpec {
         TaskKind::Localisation => &METRICS[0],
         TaskKind::Driving => &METRICS[2],
         TaskKind::Lane => &METRICS[4],
+        TaskKind::Messages => &METRICS[8],
     }
 }
 
@@ -257,7 +274,12 @@ mod tests {
 
     #[test]
     fn the_headline_is_the_first_metric_of_its_task() {
-        for task in [TaskKind::Localisation, TaskKind::Driving, TaskKind::Lane] {
+        for task in [
+            TaskKind::Localisation,
+            TaskKind::Driving,
+            TaskKind::Lane,
+            TaskKind::Messages,
+        ] {
             let first = METRICS.iter().find(|metric| metric.task == task).unwrap();
             assert_eq!(headline(task), first);
         }
@@ -287,6 +309,8 @@ mod tests {
             "route_offset_m",
             "lateral_error_m",
             "wrong_lane_percent",
+            "awareness_percent",
+            "message_kbitps",
         ];
         assert_eq!(names, of_tasks);
         let metric: PolicyMetric = serde_json::from_str("\"error_m\"").unwrap();

@@ -145,7 +145,7 @@ pub const PROCESSES: [ProcessSpec; 7] = [
         on_exit: OnExit::Replace,
         must_receive: |_, _| true,
         is_wanted: |run| run.mode.has_trainer(),
-        holds_up_ticks: |run| run.config.drives(),
+        holds_up_ticks: |run| run.config.awaits_actions(),
         program: Program::PythonModule(|run| match run.mode {
             Mode::Play => PLAYER,
             Mode::Train | Mode::Simulate => &run.config.trainer.module,

@@ -10,6 +10,7 @@
 #[path = "../tests/common/preset.rs"]
 mod preset;
 
+pub mod action_log;
 pub mod collision;
 pub mod driving;
 mod event_log;

@@ -167,9 +167,9 @@ impl FoundCheckpoint {
             );
             Err(Exit::config(message, help))
         };
-        let (size, width) = (self.manifest.observation_size, config.observation_width() as u64);
+        let (size, width) = (self.manifest.observation_size, config.policy_width() as u64);
         if size != width {
-            let help = "set observation.fields and observation.history as in the run that learnt it";
+            let help = "set observation.fields and observation.history (v2x.candidates in the messages task) as in the run that learnt it";
             return refuse("observation has", format!("{size} numbers"), width.to_string(), help);
         }
         if self.manifest.network != config.trainer.network {

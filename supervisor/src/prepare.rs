@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use ipc_schema::{
     SCHEMA_VERSION,
     config::{Config, LocalisationAction},
-    control, reserve,
+    control,
+    process::Process,
+    reserve,
     run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source, Start},
     storage,
 };
@@ -293,6 +295,12 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
         return Err(Exit::config(
             "the stages of a curriculum set the number of vehicles, but a .sumocfg has its own vehicles",
             "name the .sumocfg in curriculum.maps and give a preset or .toml as CONFIG: its net then runs with population control",
+        ));
+    }
+    if config.actor() == Some(Process::V2x) && mode == Mode::Simulate {
+        return Err(Exit::config(
+            "`v2x.inclusion` = \"policy\" needs a trainer, and `caraware simulate` has none",
+            "use `caraware train`, or set v2x.inclusion = \"standard\"",
         ));
     }
     if !config.drives() {

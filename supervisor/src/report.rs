@@ -102,7 +102,7 @@ impl Sensing {
 }
 
 /// The results of one environment.
-fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>, recording: Option<Value>) -> Value {
+fn environment_report(run: &RunFile, sensing: &Sensing, [dynamics, v2x, recording]: [Option<Value>; 3]) -> Value {
     json!({
         "environment": run.env_index,
         "seed": run.seed(),
@@ -117,6 +117,7 @@ fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>,
         "lidar": sensing.lidar,
         "camera": sensing.camera,
         "radar": sensing.radar,
+        "v2x": v2x,
         "recording": recording,
     })
 }
@@ -237,8 +238,8 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         .iter()
         .zip(&sensings)
         .map(|(run, sensing)| {
-            let dynamics = parts.read(&run.run_dir, Process::SimCore);
-            environment_report(run, sensing, dynamics, parts.read(&run.run_dir, Process::Recorder))
+            let processes = [Process::SimCore, Process::V2x, Process::Recorder];
+            environment_report(run, sensing, processes.map(|process| parts.read(&run.run_dir, process)))
         })
         .collect();
     let sensing = Sensing::total(&sensings);

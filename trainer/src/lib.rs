@@ -93,8 +93,10 @@ struct Attached {
     /// In a run with `trainer.road_users`.
     world: Option<Subscriber>,
     predictions: Publisher,
-    /// Wakes `sim-core`, which waits for predictions in the driving task.
-    sim_core: Option<Waker>,
+    /// Wakes the process that waits for actions.
+    actor: Option<Waker>,
+    /// Board of that process.
+    actor_board: Option<BoardReader>,
     /// Wakes `traffic-bridge`, which waits for the stage of the next lesson.
     traffic_bridge: Waker,
     training: TrainingStatus,
@@ -245,6 +247,13 @@ impl Attachment {
         Ok(ahead.saturating_sub(inner.consumed_ticks))
     }
 
+    /// Ticks that the process that waits for actions has finished beyond the newest one consumed.
+    fn actor_lag_ticks(&self) -> PyResult<u64> {
+        let inner = self.lock()?;
+        let ahead = inner.actor_board.as_ref().map_or(0, |board| board.health().ticks);
+        Ok(ahead.saturating_sub(inner.consumed_ticks))
+    }
+
     /// Number of refused messages: those of other runs and of replaced incarnations.
     #[getter]
     fn refused(&self) -> PyResult<u64> {
@@ -337,7 +346,7 @@ impl Attachment {
             payload[section.offset..section.offset + section.len].copy_from_slice(rows);
         }
         draft.send().map_err(|error| failed(&error))?;
-        if let Some(waker) = &inner.sim_core {
+        if let Some(waker) = &inner.actor {
             waker.wake();
         }
         Ok(())
@@ -479,10 +488,11 @@ impl Attachment {
             false => None,
         };
         let predictions = membership.publisher(Service::Prediction).map_err(membership_failed)?;
-        let sim_core = match membership.run.config.drives() {
-            true => Some(membership.waker(Process::SimCore).map_err(membership_failed)?),
-            false => None,
-        };
+        let actor = membership.run.config.actor();
+        let actor_board = actor.map(|process| membership.board_of(process)).transpose();
+        let actor_board = actor_board.map_err(membership_failed)?;
+        let actor = actor.map(|process| membership.waker(process)).transpose();
+        let actor = actor.map_err(membership_failed)?;
         let traffic_bridge = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
         let sensor_daemon = membership.board_of(Process::SensorDaemon).map_err(membership_failed)?;
         let journal_first = sensor_daemon.progress().committed_ticks;
@@ -509,7 +519,8 @@ impl Attachment {
             lanes: None,
             world,
             predictions,
-            sim_core,
+            actor,
+            actor_board,
             traffic_bridge,
             training: TrainingStatus::default(),
             traffic: None,
@@ -824,11 +835,11 @@ fn id_hash(id: &str) -> u64 {
     ipc_schema::traffic::id_hash(id)
 }
 
-/// Numbers in a row of the observation of the run that `run_file` describes.
+/// Numbers in a row that a policy sees in the run that `run_file` describes.
 #[pyfunction]
 fn observation_size(run_file: &str) -> PyResult<usize> {
     let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
-    Ok(run.config.observation_width())
+    Ok(run.config.policy_width())
 }
 
 /// Gives two paths each other's names, from one moment to the next.
@@ -851,6 +862,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;
     module.add_function(wrap_pyfunction!(exchange, module)?)?;
+    module.add("SPEAKER_COLUMNS", ipc_schema::neighbours::SPEAKER_COLUMNS)?;
+    module.add("CANDIDATE_COLUMNS", ipc_schema::neighbours::CANDIDATE_COLUMNS)?;
     module.add("METRICS", PyTuple::new(module.py(), METRICS.iter().map(Metric::of))?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("LAYOUT_VERSION", ipc_schema::run::LAYOUT_VERSION)?;

@@ -108,6 +108,10 @@ class SyntheticChannel:
         """No lag: every returned tick has been consumed."""
         return 0
 
+    def actor_lag_ticks(self) -> int:
+        """No process waits for actions."""
+        return 0
+
     def done(self) -> None:
         """Remember the end."""
         self.is_done = True

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
-from caraware.run.player import DrivingScoreboard, PlayTally
+from caraware.run.player import FollowedScoreboard, PlayTally
 from caraware.tasks import ends
 from synthetic import SyntheticObservation, run_file
 from synthetic_vehicle import sensor_tables
@@ -136,6 +136,10 @@ class Lane:
         """Lock-step."""
         return 2
 
+    def actor_lag_ticks(self) -> int:
+        """Lock-step."""
+        return 2
+
     def done(self) -> None:
         """Remember the end."""
         self.is_done = True
@@ -209,7 +213,7 @@ def test_the_table_of_a_player_is_empty_when_an_episode_begins(tmp_path: Path) -
     run = lane_run(tmp_path, 1e-3)
     run["config"] = sensor_tables() | run["config"]
     lane = Lane(run, 10)
-    board = DrivingScoreboard(lane.run, RunConfig.from_run(run), PlayTally())
+    board = FollowedScoreboard(lane.run, RunConfig.from_run(run), PlayTally())
     rows = []
     for episode in (0, 0, 1, 1):
         (obs,) = lane.receive(0.0)

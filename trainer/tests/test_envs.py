@@ -29,6 +29,7 @@ ROOT = Path(__file__).parents[2]
 CARAWARE = ROOT / "target" / "release" / "caraware"
 TOWN: dict[str, Any] = {"traffic.cavs": 4, "traffic.others": 2, "traffic.pedestrians": 2, "episode.ticks": 40}
 DRIVING = {"traffic.others": 3, "traffic.pedestrians": 2, "episode.ticks": 150, "task.time_limit_s": 4.0}
+SPEAKING: dict[str, Any] = TOWN | {"v2x.candidates": 3}
 HEROES: dict[str, Any] = DRIVING | {"traffic.heroes": 3, "traffic.hero_route": []}
 
 
@@ -87,7 +88,7 @@ def test_pettingzoos_api_test_passes_with_heroes_that_come_and_go() -> None:
 
 
 @pytest.mark.filterwarnings("error:.*[Aa]gent:UserWarning")
-@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES)])
+@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES), ("messages", SPEAKING)])
 def test_pettingzoos_api_test_passes_with_slots_as_agents(config: str, settings: dict[str, Any]) -> None:
     with make(config, settings) as simulation:
         env = CarAwareParallelEnv(simulation)
@@ -103,7 +104,8 @@ def test_pettingzoos_seed_test_passes(agents: str) -> None:
 
 def episode_of(env: CarAwareVectorEnv, steps: int) -> list[np.ndarray]:
     """Everything that `steps` steps with the same actions give."""
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, env.num_envs, 2)).astype(np.float32)
+    shape = (steps, env.num_envs, int(env.single_action_space.sample().size))
+    actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
     seen = []
     for action in actions:
         observation, reward, terminated, truncated, infos = env.step(action)
@@ -111,7 +113,7 @@ def episode_of(env: CarAwareVectorEnv, steps: int) -> list[np.ndarray]:
     return seen
 
 
-@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES)])
+@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES), ("messages", SPEAKING)])
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(config: str, settings: dict[str, Any]) -> None:
     def run(env: CarAwareVectorEnv, seed: int) -> list[np.ndarray]:
         first, infos = env.reset(seed=seed)

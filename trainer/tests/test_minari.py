@@ -145,3 +145,16 @@ def test_a_recording_without_predictions_is_refused(tmp_path: Path) -> None:
     # No process of a simulation predicts.
     with recorded_run("simulate", TRAINED) as run_dir, pytest.raises(RecordingError, match="prediction"):
         export(run_dir, "minari", tmp_path, 1, unseen)
+
+
+def test_a_task_whose_rewards_do_not_follow_from_what_was_published_is_refused(tmp_path: Path) -> None:
+    speaking = TRAINED | {
+        "task.kind": "messages",
+        "v2x.share": 1.0,
+        "v2x.perception_range_m": 60.0,
+        "v2x.inclusion": "policy",
+        "trainer.actions_per_observation": 1,
+        "trainer.supervised": "false",
+    }
+    with recorded_run("train", speaking) as run_dir, pytest.raises(RecordingError, match="'messages'"):
+        export(run_dir, "minari", tmp_path, 1, unseen)

@@ -14,10 +14,20 @@ from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows
 from caraware.ipc.arrays import BoolArray
 from caraware.ipc.run_file import ConfigError, RunFile
-from caraware.tasks.contract import EndKind, Sampling, Task, TaskOutcome, TaskRows, TaskStep
-from caraware.tasks.driving import Driving, OutcomeMissingError
+from caraware.learn.encoders import CandidateNetwork
+from caraware.tasks.contract import (
+    EndKind,
+    OutcomeMissingError,
+    Sampling,
+    Task,
+    TaskOutcome,
+    TaskRows,
+    TaskStep,
+)
+from caraware.tasks.driving import Driving
 from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
+from caraware.tasks.messages import Messages, speech_width
 from caraware.tasks.metrics import reference_names
 from caraware.tasks.table import TASKS, task_of_run
 from torch import Tensor
@@ -31,7 +41,8 @@ def run_of(task: str) -> RunFile:
     observation = {"fields": ["route_left", "route_offset"], "history": 1, "scale": "minus_one_to_one"}
     config = {
         "run": {"tick_s": 0.1, "window_ticks": 16},
-        "task": {"kind": task},
+        "task": {"kind": task, "message_cost": 10.0},
+        "v2x": {"candidates": 3},
         "curriculum": {"maps": []},
         "traffic": {"cavs": ROWS, "heroes": ROWS, "hero_ids": [], "pedestrians": 0},
         "episode": {"ticks": 100},
@@ -80,7 +91,8 @@ def task(request: pytest.FixtureRequest) -> Task:
 
 
 def test_a_task_has_the_name_of_its_row_and_metrics_of_its_own(task: Task) -> None:
-    assert isinstance(task, {"localisation": Localisation, "driving": Driving, "lane": LanePosition}[task.name])
+    classes = {"localisation": Localisation, "driving": Driving, "lane": LanePosition, "messages": Messages}
+    assert isinstance(task, classes[task.name])
     assert task.metrics and {metric.task for metric in task.metrics} == {task.name}
     assert task.metrics[0].reference_for is None
     assert {metric.name for metric in _native.METRICS if metric.task == task.name} == {m.name for m in task.metrics}
@@ -201,4 +213,35 @@ def test_the_ends_of_driving_are_as_documented() -> None:
 def test_an_unknown_task_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="no task is called 'parking'") as refused:
         task_of_run(run_of("parking"))
-    assert refused.value.help == "`task.kind` is one of: localisation, driving, lane"
+    assert refused.value.help == "`task.kind` is one of: localisation, driving, lane, messages"
+
+
+def test_messages_are_rewarded_by_what_others_newly_know_less_the_price_of_bytes() -> None:
+    task = task_of_run(run_of("messages"))
+    achieved = torch.tensor([[1.5, 150.0, 3.0, 4.0], [0.0, 0.0, 0.0, 0.0], [9.0, 90.0, 2.0, 2.0]])
+    before = TaskRows(torch.zeros(3, 53), torch.zeros(3, 4))
+    none = torch.zeros(3, dtype=torch.bool)
+    left = torch.tensor([False, False, True])
+    given = TaskStep(before.observation, before.truth, TaskOutcome(TaskRows(before.observation, achieved), none, left))
+    action = torch.zeros(3, 3)
+    # 150 bytes at 10 s a kilobyte cost 1.5 s. What a vehicle that left told is not its last action's.
+    assert task.reward(given, action).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    measured = task.measure(given, action)
+    assert measured["awareness_percent"].tolist() == [75.0, 100.0, 100.0]
+    assert measured["message_kbitps"].tolist() == pytest.approx([12.0, 0.0, 7.2])
+    with pytest.raises(OutcomeMissingError):
+        task.reward(TaskStep(before.observation, before.truth), action)
+
+
+def test_each_candidate_is_judged_alike_wherever_it_stands() -> None:
+    width = speech_width(3)
+    network = CandidateNetwork(width, 3, (8,))
+    value = CandidateNetwork(width, 1, (8,))
+    rows = torch.rand(5, width, generator=torch.Generator().manual_seed(4))
+    station, columns = _native.SPEAKER_COLUMNS, _native.CANDIDATE_COLUMNS
+    members = rows[:, station:].view(5, 3, columns)
+    turned = torch.cat([rows[:, :station], members[:, [2, 0, 1]].reshape(5, -1)], 1)
+    assert torch.allclose(network(turned), network(rows)[:, [2, 0, 1]], atol=1e-6)
+    assert torch.allclose(value(turned), value(rows), atol=1e-6) and value(rows).shape == (5, 1)
+    with pytest.raises(ValueError, match="messages"):
+        CandidateNetwork(width + 1, 3, (8,))

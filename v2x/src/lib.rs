@@ -6,6 +6,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
 pub mod capture;
+pub mod choices;
 pub mod exchange;
 pub mod local_map;
 pub mod message;

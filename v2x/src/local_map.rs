@@ -220,6 +220,11 @@ impl HeardObjects {
         );
     }
 
+    /// The objects of these numbers, which have not been given up.
+    pub fn of(&self, numbers: Range<u32>) -> impl Iterator<Item = &KnownObject> {
+        numbers.map(|number| self.object(number))
+    }
+
     /// Forgets everything.
     pub fn clear(&mut self) {
         *self = Self::default();
@@ -386,6 +391,18 @@ impl LocalMap {
         numbers
             .filter(|number| **number != NO_OBJECT)
             .map(|number| heard.object(*number))
+    }
+
+    /// Number of stations that it knows something from.
+    #[must_use]
+    pub fn stations(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// True if it knows something from this station.
+    #[must_use]
+    pub fn has_heard(&self, station: u32) -> bool {
+        self.blocks.binary_search_by_key(&station, |block| block.sender).is_ok()
     }
 
     /// Number of known objects, each station's view of an object counted.

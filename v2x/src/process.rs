@@ -25,7 +25,8 @@ use sim_core::{geodesy::Projection, scene::Scene};
 
 use crate::{
     capture::CaptureFile,
-    exchange::{ExchangeCounts, MessageExchange, SlotMeasurement},
+    choices::ChoicePort,
+    exchange::{ExchangeCounts, MessageExchange, SlotMeasurement, speech::SpeechCounts},
     station::OwnMeasurement,
 };
 
@@ -36,6 +37,8 @@ struct V2xState {
     counts: ExchangeCounts,
     load_sum: f64,
     radio_ticks: u64,
+    #[serde(default)]
+    speech: SpeechCounts,
 }
 
 /// What this process adds to the run's report.
@@ -48,8 +51,34 @@ struct V2xReport {
     counts: ExchangeCounts,
     /// Mean share of time in which a radio finds the channel busy.
     mean_channel_load: Option<f64>,
+    /// In the messages task: what messages have achieved.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    speech: Option<SpeechReport>,
     #[serde(flatten)]
     delivery: DeliveryFigures,
+}
+
+/// What messages have achieved in the messages task.
+#[derive(Debug, Serialize)]
+struct SpeechReport {
+    #[serde(flatten)]
+    counts: SpeechCounts,
+    /// Share of the road users in range that a station knows, over all stations and ticks.
+    awareness: Option<f64>,
+    /// Collective perception messages of a station, kbit/s.
+    message_kbitps: Option<f64>,
+}
+
+impl SpeechReport {
+    #[expect(clippy::cast_precision_loss, reason = "means in a report")]
+    fn new(counts: SpeechCounts, tick_s: f64) -> Self {
+        let station_s = counts.station_ticks as f64 * tick_s;
+        Self {
+            awareness: (counts.in_range > 0).then(|| counts.known as f64 / counts.in_range as f64),
+            message_kbitps: (station_s > 0.0).then(|| counts.cpm_bytes as f64 * 8.0 / 1000.0 / station_s),
+            counts,
+        }
+    }
 }
 
 /// Exchanges messages until the last tick of the run, or until the process is asked to stop.
@@ -105,6 +134,8 @@ struct V2xProcess {
     membership: RunMembership,
     exchange: MessageExchange,
     neighbours: TickPublisher,
+    /// What the trainer chooses, where messages are its choice.
+    choices: Option<ChoicePort>,
     /// The file of the episode, where messages are captured.
     capture: Option<CaptureFile>,
     digest: ObservationDigest,
@@ -125,13 +156,19 @@ impl V2xProcess {
         let mut exchange = MessageExchange::new(&membership.run.config, maps);
         let state: V2xState = membership.stored_episode_state()?.unwrap_or_default();
         exchange.set_counts(state.counts);
+        exchange.set_speech_counts(state.speech);
         let neighbours = TickPublisher::open(&membership, Channel::Neighbours)?;
+        let choices = match membership.run.config.actor() {
+            Some(Process::V2x) => Some(ChoicePort::open(&mut membership)?),
+            _ => None,
+        };
         membership.attach();
         let tick = membership.run.first_tick();
         Ok(Self {
             membership,
             exchange,
             neighbours,
+            choices,
             capture: None,
             digest: state.digest,
             load_sum: state.load_sum,
@@ -155,7 +192,7 @@ impl V2xProcess {
         let states: &[VehicleState] =
             block::view(world.payload(), WorldLayout::of(world.header()).states).map_err(unreadable)?;
         let slots = slots_of(measurement, &self.membership.run.config).map_err(unreadable)?;
-        let layout = NeighboursLayout::sized(slots.len(), self.membership.run.config.v2x.neighbours as usize);
+        let layout = NeighboursLayout::of_config(&self.membership.run.config, slots.len());
         let waited = self
             .neighbours
             .wait_for_credit(&mut self.membership, header.tick, layout.len)?;
@@ -165,12 +202,32 @@ impl V2xProcess {
         self.publish(&header, &slots, states, &layout)?;
         // What is sent after the last tick of an episode arrives nowhere.
         if !header.has(LAST_OF_EPISODE) {
+            if self.choose(&header, &slots)? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
             self.exchange.send(&header, &slots, states);
         }
         if self.membership.run.config.v2x.pcap {
             self.capture(&header)?;
         }
         self.report(&header);
+        Ok(Wait::Ready)
+    }
+
+    /// Waits for the trainer's choices where messages are its choice.
+    fn choose(&mut self, header: &MessageHeader, slots: &[SlotMeasurement]) -> Result<Wait, Failure> {
+        let Some(port) = &mut self.choices else {
+            return Ok(Wait::Ready);
+        };
+        let Some(choices) = port.next(&mut self.membership, &mut self.neighbours, header, slots)? else {
+            return Ok(Wait::Stopped);
+        };
+        let mut choices = choices.iter().peekable();
+        for (slot, measured) in slots.iter().enumerate() {
+            if let Some(choice) = choices.next_if(|choice| choice.vehicle == measured.vehicle) {
+                self.exchange.choose(slot, choice.places);
+            }
+        }
         Ok(Wait::Ready)
     }
 
@@ -231,6 +288,7 @@ impl V2xProcess {
             counts: self.exchange.counts(),
             load_sum: self.load_sum,
             radio_ticks: self.radio_ticks,
+            speech: self.exchange.speech_counts(),
         };
         self.membership.store_episode_state(tick, &state)
     }
@@ -272,6 +330,12 @@ impl V2xProcess {
             ticks: self.tick,
             counts: self.exchange.counts(),
             mean_channel_load: mean,
+            speech: self
+                .membership
+                .run
+                .config
+                .speaks()
+                .then(|| SpeechReport::new(self.exchange.speech_counts(), self.membership.run.config.run.tick_s)),
             delivery: self.neighbours.figures(),
         })
     }

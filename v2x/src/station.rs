@@ -158,8 +158,12 @@ pub struct Station {
     pub denm: DenmService,
     /// The warning that is repeated.
     pub warning: Option<Denm>,
-    /// What its own sensors perceived at the last tick.
+    /// What its own sensors perceived at the last tick, as others would know it.
     pub perceived: Vec<KnownObject>,
+    /// Messages task: what its own sensors perceive at this tick, the nearest first; `None` if it cannot tell of it.
+    pub sighted: Option<Vec<Perception>>,
+    /// Places of the objects among those that its next message lists, ascending, where they are chosen.
+    pub chosen: Vec<usize>,
     /// Warnings of others that a roadside unit has yet to send once more.
     pub relay: WarningRelay,
     /// Congestion control.
@@ -207,6 +211,8 @@ fn fix_time_ns(now_ns: u64, own: &OwnMeasurement) -> u64 {
 /// What a station may be said to perceive: the object in the frame of its own vehicle, with errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Perception {
+    /// Row of the road user in the world: no station knows it.
+    pub row: u32,
     /// Number of the object at the station.
     pub object: u16,
     /// Its centre before and to the left of the middle of the vehicle's front, metres.
@@ -222,6 +228,12 @@ pub struct Perception {
 }
 
 impl Perception {
+    /// Distance from the middle of the vehicle's front, metres.
+    #[must_use]
+    pub fn distance_m(&self) -> f64 {
+        libm::hypot(self.position_body_m[0], self.position_body_m[1])
+    }
+
     /// The object in the world, by the station's own fix and compass.
     #[must_use]
     pub fn motion(&self, own: &OwnMeasurement, size: &VehicleSize) -> MeasuredMotion {

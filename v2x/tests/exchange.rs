@@ -138,6 +138,8 @@ fn run_with(
             radio: &mut block.radio,
             channel_load: &mut block.channel_load,
             vehicle: &mut vec![0; count],
+            speech: &mut [],
+            achieved: &mut [],
         };
         exchange.receive(&header, &slots, &moved, &mut sections);
         exchange.send(&header, &slots, &moved);

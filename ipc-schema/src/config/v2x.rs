@@ -48,6 +48,20 @@ pub enum V2xListing {
     Separate,
 }
 
+/// Which of the objects that a vehicle perceives its collective perception messages list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum V2xInclusion {
+    /// Those that the rules of ETSI TS 103 324 name.
+    Standard,
+    /// All, at every tick.
+    All,
+    /// Those that a station nearby lacks, as if all maps were known: the bound for every other choice.
+    Needed,
+    /// Those that the trainer chooses, in the messages task.
+    Policy,
+}
+
 /// A service of a roadside unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoadsideService {
@@ -177,6 +191,12 @@ pub struct V2xConfig {
     pub congestion_control: V2xCongestionControl,
     /// Range in which a vehicle perceives objects for its collective perception messages, metres; 0 = no such messages.
     pub perception_range_m: f64,
+    /// Which of the perceived objects these messages list.
+    pub inclusion: V2xInclusion,
+    /// Messages task: the nearest perceived objects that the policy chooses from.
+    pub candidates: u32,
+    /// Messages task: range in which a station is to know all road users, metres.
+    pub awareness_range_m: f64,
     /// Standard deviation of the position of a perceived object on each axis, metres.
     pub perception_position_std_m: f64,
     /// Standard deviation of the speed of a perceived object on each axis, m/s.

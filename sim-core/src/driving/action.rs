@@ -1,11 +1,22 @@
 //! The action of a hero: its range, and the control input that it stands for.
 
+use bytemuck::{Pod, Zeroable};
 use ipc_schema::config;
 
 use crate::models::state::ControlInput;
 
 /// Steering and acceleration, each in −1 … 1.
 pub type HeroAction = [f32; 2];
+
+/// The action of a hero, as it is logged.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub struct LoggedAction {
+    /// Dense index of the hero.
+    pub vehicle: u32,
+    /// Steering and acceleration, as they came.
+    pub action: HeroAction,
+}
 
 /// The control input of an action: −1 … 1 of the largest road-wheel angle (left is positive), and of the largest
 /// acceleration or deceleration.

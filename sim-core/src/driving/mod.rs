@@ -13,7 +13,6 @@ use ipc_schema::{
 };
 
 pub mod action;
-pub mod log;
 pub mod ports;
 pub mod route;
 pub mod surroundings;

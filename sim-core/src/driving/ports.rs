@@ -17,12 +17,11 @@ use ipc_schema::{
     world::{HeroView, VehicleState, WorldLayout},
 };
 
-use super::{
-    DrivingTask, HeroCounts, RefusedAction,
-    log::{ActionLog, LoggedAction},
-};
-use crate::{mirror::Mirror, scene::Scene};
+use super::{DrivingTask, HeroCounts, RefusedAction, action::LoggedAction};
+use crate::{action_log::ActionLog, mirror::Mirror, scene::Scene};
 
+/// Ticks that sensors are ahead of the actions, in strict lock-step.
+const SENSED_AHEAD: u64 = 2;
 /// Values of an action: steering and acceleration.
 const ACTION_COLUMNS: u32 = 2;
 
@@ -33,9 +32,7 @@ pub struct HeroPorts {
     /// SUMO's ids of the heroes of this episode, by dense index.
     ids: BTreeMap<u32, String>,
     driver: HeroDriver,
-    log: ActionLog,
-    /// The episode that is logged.
-    logged_episode: Option<u64>,
+    log: ActionLog<LoggedAction>,
     predictions: Subscriber,
     observations: Subscriber,
     poses: Publisher,
@@ -56,8 +53,7 @@ impl HeroPorts {
             ids: BTreeMap::new(),
             driving,
             driver: membership.run.config.task.driver,
-            log: ActionLog::new(&membership.run.run_dir, membership.run.env_index),
-            logged_episode: None,
+            log: ActionLog::new(&membership.run.run_dir, membership.run.env_index, SENSED_AHEAD),
             predictions: membership.subscriber(Channel::Prediction)?,
             observations: membership.subscriber(Channel::Observation)?,
             poses: membership.publisher(Channel::EgoPose)?,
@@ -101,52 +97,13 @@ impl HeroPorts {
         if self.driver == HeroDriver::Sumo {
             return Ok(Wait::Ready);
         }
-        if self.logged_episode != Some(frame.episode) {
-            self.logged_episode = Some(frame.episode);
-            // A resumed run draws anew what it has not learnt; processes that are started again within a run do not.
-            let run = &membership.run;
-            let newest = if run.restart.is_some() {
-                u64::MAX
-            } else {
-                run.committed_ticks()
-            };
-            self.log
-                .begin(frame.episode, newest)
-                .map_err(|error| unlogged(&error))?;
-        }
-        if let Some(actions) = self.log.take(frame.tick) {
+        let run = &membership.run;
+        if let Some(actions) = self.log.actions_before(run, frame.episode, frame.tick)? {
             // The trainer may answer these ticks again: its answers must not fill the queue.
             while self.predictions.receive()?.is_some() {}
             while self.observations.receive()?.is_some() {}
             self.apply(&actions, frame.tick, mirror);
             return Ok(Wait::Ready);
-        }
-        let run = &membership.run;
-        if run.restart.is_none() && (run.first_tick() + 1..=run.committed_ticks()).contains(&frame.tick) {
-            return Err(Failure::new(
-                FailureKind::Run,
-                format!(
-                    "the actions that moved tick {} are not in the run's directory",
-                    frame.tick
-                ),
-            )
-            .with_help(
-                "resume the run by its name; or start another that begins with task.begin_from = \"CHECKPOINT\"",
-            ));
-        }
-        // Ticks that were sensed were made with actions, but for those that were under way.
-        if let Some(restart) = run.restart
-            && frame.tick > run.first_tick()
-            && frame.tick + 2 < restart.sensed_ticks
-        {
-            return Err(Failure::new(
-                FailureKind::Run,
-                format!(
-                    "the actions that moved tick {} are not in the run's directory, which keeps those of the newest episodes",
-                    frame.tick
-                ),
-            )
-            .with_help("let the learner commit more often, or free space for the run's directory"));
         }
         // The first tick of this process begins an episode: no hero has been seen before it.
         let Some(before) = frame
@@ -279,11 +236,6 @@ fn vehicles(question: &Message) -> Result<&[u32], BlockError> {
     let header = question.header();
     let layout = ObservationLayout::of(header);
     block::view(question.payload(), layout.vehicle)
-}
-
-fn unlogged(error: &std::io::Error) -> Failure {
-    Failure::new(FailureKind::Run, format!("cannot log the actions of heroes: {error}"))
-        .with_help("free space for the run's directory")
 }
 
 fn unreadable(error: BlockError) -> Failure {

@@ -18,7 +18,7 @@ pub use error::ConfigError;
 use layer::{LocatedValue, SettingsLayer};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
-pub const PRESETS: [(&str, &str); 7] = [
+pub const PRESETS: [(&str, &str); 8] = [
     ("town", include_str!("../../../configs/town.toml")),
     ("paper", include_str!("../../../configs/paper.toml")),
     ("driving", include_str!("../../../configs/driving.toml")),
@@ -26,6 +26,7 @@ pub const PRESETS: [(&str, &str); 7] = [
     ("fusion", include_str!("../../../configs/fusion.toml")),
     ("camera", include_str!("../../../configs/camera.toml")),
     ("cooperation", include_str!("../../../configs/cooperation.toml")),
+    ("messages", include_str!("../../../configs/messages.toml")),
 ];
 
 /// Merged settings, each remembering where it was set.

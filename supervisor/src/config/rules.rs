@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     channel::Channel,
-    config::{Config, HeroDriver, Network, TaskKind, TrafficEngine, VehicleModel},
+    config::{Config, HeroDriver, Network, TaskKind, TrafficEngine, V2xInclusion, VehicleModel},
 };
 
 mod curriculum;
@@ -98,9 +98,11 @@ pub const OWN_TRAINER: &str = "caraware.train";
 /// Heroes need the driving task, and the driving task needs heroes.
 fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = if config.drives() {
-        undrivable(config)
+        undrivable(config).or_else(|| actions_without_tick(config))
     } else {
         heroes_without_a_driver(config)
+            .or_else(|| unspeakable(config))
+            .or_else(|| actions_without_tick(config))
     };
     match refused {
         None => Ok(()),
@@ -221,29 +223,69 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "set trainer.module = \"caraware.driving.imitate\", or task.driver = \"actions\"",
         ));
     }
-    let draws_actions = config.trainer.module == OWN_TRAINER && config.task.driver == HeroDriver::Actions;
-    if draws_actions && config.trainer.network == Network::Cnn {
+    None
+}
+
+/// The messages task needs messages whose content can be chosen, and nothing else lets the trainer choose it.
+fn unspeakable(config: &Config) -> Option<BrokenRule> {
+    let v2x = &config.v2x;
+    if !config.speaks() {
+        return (v2x.inclusion == V2xInclusion::Policy).then(|| {
+            (
+                "v2x.inclusion",
+                "`v2x.inclusion` = \"policy\" needs a trainer that chooses".into(),
+                "set task.kind = \"messages\", or another v2x.inclusion",
+            )
+        });
+    }
+    if !v2x.is_on() {
+        return Some((
+            "v2x.share",
+            "`task.kind` = \"messages\", but no road user has a radio".into(),
+            "set v2x.share above 0",
+        ));
+    }
+    (v2x.perception_range_m == 0.0).then(|| {
+        (
+            "v2x.perception_range_m",
+            "`task.kind` = \"messages\", but vehicles perceive nothing that they could tell of".into(),
+            "set v2x.perception_range_m, such as to 60",
+        )
+    })
+}
+
+/// Actions that the world waits for are drawn tick by tick, from fields alone.
+fn actions_without_tick(config: &Config) -> Option<BrokenRule> {
+    let draws = matches!(config.task.kind, TaskKind::Driving | TaskKind::Messages)
+        && config.trainer.module == OWN_TRAINER
+        && config.task.driver == HeroDriver::Actions;
+    if !draws {
+        return None;
+    }
+    if config.trainer.network == Network::Cnn {
         return Some((
             "trainer.network",
-            "`trainer.network` = \"cnn\" does not drive: its actions would be drawn without its images".into(),
+            "`trainer.network` = \"cnn\" does not draw actions tick by tick: it would draw them without its images"
+                .into(),
             "set trainer.network = \"mlp\" or a class",
         ));
     }
-    if draws_actions && config.trainer.network == Network::Gru {
+    if config.trainer.network == Network::Gru {
         return Some((
             "trainer.network",
-            "`trainer.network` = \"gru\" does not drive: its actions would be drawn without its memory".into(),
+            "`trainer.network` = \"gru\" does not draw actions tick by tick: it would draw them without its memory"
+                .into(),
             "set trainer.network = \"mlp\" or a class",
         ));
     }
-    (draws_actions && config.trainer.actions_per_observation > 1).then(|| {
+    (config.trainer.actions_per_observation > 1).then(|| {
         (
             "trainer.actions_per_observation",
             format!(
-                "`trainer.actions_per_observation` = {}: a hero takes one action at a time",
+                "`trainer.actions_per_observation` = {}: the world takes one action at a time",
                 config.trainer.actions_per_observation
             ),
-            "set trainer.actions_per_observation = 1 with task.kind = \"driving\"",
+            "set trainer.actions_per_observation = 1",
         )
     })
 }

@@ -419,7 +419,7 @@ fn a_gate_names_a_metric_of_the_task_and_the_value_that_it_must_reach() {
     );
     assert!(
         help.starts_with(
-            "allowed: \"error_m\", \"progress_mps\", \"route_offset_m\", \"lateral_error_m\", \"wrong_lane_percent\". "
+            "allowed: \"error_m\", \"progress_mps\", \"route_offset_m\", \"lateral_error_m\", \"wrong_lane_percent\", \"awareness_percent\", \"message_kbitps\". "
         ),
         "{help}"
     );
@@ -647,7 +647,7 @@ fn every_choice_of_a_key_is_a_value_of_its_type() {
 }
 
 #[test]
-fn heroes_need_the_driving_task_and_the_task_needs_heroes() {
+fn what_acts_needs_a_task_and_a_task_needs_what_acts() {
     let cases = [
         (
             "traffic.heroes = 1",
@@ -681,13 +681,33 @@ fn heroes_need_the_driving_task_and_the_task_needs_heroes() {
         ),
         (
             "task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.network = \"gru\"",
-            "`trainer.network` = \"gru\" does not drive",
+            "`trainer.network` = \"gru\" does not draw actions tick by tick",
             "set trainer.network = \"mlp\"",
         ),
         (
             "task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.actions_per_observation = 2",
-            "`trainer.actions_per_observation` = 2: a hero takes one action at a time",
+            "`trainer.actions_per_observation` = 2: the world takes one action at a time",
             "set trainer.actions_per_observation = 1",
+        ),
+        (
+            "v2x.share = 1.0\nv2x.inclusion = \"policy\"",
+            "`v2x.inclusion` = \"policy\" needs a trainer that chooses",
+            "task.kind = \"messages\"",
+        ),
+        (
+            "task.kind = \"messages\"",
+            "`task.kind` = \"messages\", but no road user has a radio",
+            "set v2x.share above 0",
+        ),
+        (
+            "task.kind = \"messages\"\nv2x.share = 0.5",
+            "but vehicles perceive nothing that they could tell of",
+            "set v2x.perception_range_m",
+        ),
+        (
+            "task.kind = \"messages\"\nv2x.share = 0.5\nv2x.perception_range_m = 60.0\ntrainer.network = \"gru\"",
+            "`trainer.network` = \"gru\" does not draw actions tick by tick",
+            "set trainer.network = \"mlp\"",
         ),
     ];
     for (text, expected, cure) in cases {

@@ -1,12 +1,10 @@
 //! What a successor says of itself when it is ready, compared with the run before the old trainer leaves.
 
-use ipc_schema::{SCHEMA_VERSION, run::RunFile};
+use ipc_schema::{SCHEMA_VERSION, config::Config, run::RunFile};
 use serde::Deserialize;
 
 /// The line on a successor's standard output that it is ready begins with this word; its claims may follow as JSON.
 const READY: &str = "ready";
-/// Numbers in an action of every task.
-const ACTION_SIZE: u64 = 2;
 
 /// What a successor is made for. It need not say everything: what is left out is not compared.
 #[derive(Debug, Default, Deserialize)]
@@ -42,7 +40,7 @@ impl SuccessorClaims {
         differ(
             "takes observations of size",
             self.observation_size,
-            config.observation_width() as u64,
+            config.policy_width() as u64,
         )?;
         let fields: Vec<String> = config
             .observation
@@ -59,7 +57,7 @@ impl SuccessorClaims {
             return Err(message);
         }
         differ("is for the task", self.task.as_deref(), config.task.kind.name())?;
-        differ("gives actions of size", self.action_size, ACTION_SIZE)?;
+        differ("gives actions of size", self.action_size, action_size(config))?;
         differ(
             "learns from this number of environments:",
             self.environments,
@@ -78,6 +76,14 @@ impl SuccessorClaims {
 }
 
 /// Compares one claim with the run's value.
+/// Numbers in an action of the run's task.
+fn action_size(config: &Config) -> u64 {
+    match config.speaks() {
+        true => config.v2x.candidates.into(),
+        false => 2,
+    }
+}
+
 fn differ<T: PartialEq + std::fmt::Display>(what: &str, claimed: Option<T>, own: T) -> Result<(), String> {
     match claimed {
         Some(claimed) if claimed != own => Err(format!("it {what} {claimed}, the run's is {own}")),

@@ -9,13 +9,13 @@
 
 mod common;
 
+mod awaited_actions;
 mod bad_input;
 mod classes;
 mod collisions;
 mod control;
 mod curriculum;
 mod driving;
-mod driving_learner;
 mod environment_restart;
 mod environments;
 mod fanout;

@@ -13,6 +13,7 @@ from torch import Tensor
 from typing_extensions import Buffer
 
 __all__ = [
+    "CANDIDATE_COLUMNS",
     "CLIPPED",
     "EMPTY_SLOT",
     "ENDED_AGAINST_TRAFFIC",
@@ -29,6 +30,7 @@ __all__ = [
     "METRICS",
     "RESYNCHRONISED",
     "SCHEMA_VERSION",
+    "SPEAKER_COLUMNS",
     "TERMINATED",
     "TRUNCATED",
     "TRUTH_COLUMNS",
@@ -53,6 +55,11 @@ LAYOUT_VERSION: int
 
 METRICS: tuple[Metric, ...]
 """Every metric of every task, in the order of the board."""
+
+SPEAKER_COLUMNS: int
+"""Numbers of a station in a row of `speech` (messages task)."""
+CANDIDATE_COLUMNS: int
+"""Numbers of each candidate behind them."""
 
 LAYOUT_JSON: str
 """The tables of `ipc-schema/layout.json`: records, payloads, sensors and fields."""
@@ -147,6 +154,9 @@ class Attachment:
 
         The first call subscribes and returns none.
         """
+
+    def actor_lag_ticks(self) -> int:
+        """Ticks that the process that waits for actions has finished beyond the newest tick consumed here."""
 
     def lag_ticks(self) -> int:
         """Ticks that `traffic-bridge` is ahead of the newest tick consumed here."""

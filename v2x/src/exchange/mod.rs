@@ -5,9 +5,9 @@
 use std::{ops::Range, sync::Arc};
 
 use ipc_schema::{
-    config::{Config, RoadsideService, V2xConfig, V2xListing},
+    config::{Config, RoadsideService, V2xConfig, V2xInclusion, V2xListing},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
+    neighbours::{ACHIEVED_COLUMNS, NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     observation::EMPTY_SLOT,
     traffic::Kind,
     world::VehicleState,
@@ -48,8 +48,10 @@ use crate::{
 
 mod outgoing;
 mod perception;
+pub mod speech;
 
 use outgoing::{OutgoingMessage, SendingService, StationTick, outgoing};
+use speech::SpeechCounts;
 
 /// Height of an antenna above the roof, metres.
 const ANTENNA_M: f64 = 0.1;
@@ -118,6 +120,8 @@ pub struct AirPacket {
 struct RadioActivity {
     sent: u32,
     bytes: u32,
+    /// Those of collective perception messages.
+    cpm_bytes: u32,
     received: u32,
     load: f32,
 }
@@ -157,6 +161,11 @@ pub struct MessageExchange {
     /// Messages of the last tick, where they are captured.
     air: Vec<AirPacket>,
     counts: ExchangeCounts,
+    /// The messages task: what messages have achieved in all.
+    speech: SpeechCounts,
+    /// By slot: what the messages of the tick before have achieved.
+    achieved: Vec<[f32; ACHIEVED_COLUMNS]>,
+    speaks: bool,
 }
 
 impl MessageExchange {
@@ -204,6 +213,9 @@ impl MessageExchange {
             rows: Vec::new(),
             air: Vec::new(),
             counts: ExchangeCounts::default(),
+            speech: SpeechCounts::default(),
+            achieved: Vec::new(),
+            speaks: config.speaks(),
             config: v2x,
         }
     }
@@ -254,6 +266,10 @@ impl MessageExchange {
             self.begin_episode(header);
         }
         self.take_slots(slots, states);
+        if self.speaks || self.config.inclusion == V2xInclusion::Needed {
+            self.perceive(header.sim_time_ns, slots, states);
+            self.weigh(header.sim_time_ns, self.config.inclusion == V2xInclusion::Needed);
+        }
         let now_ms = (header.sim_time_ns / 1_000_000) as i64;
         let lifetime_ms = (self.config.object_lifetime_s * 1000.0) as i64;
         let (objects, heard, inbox) = (&self.objects, &self.heard, &self.inbox);
@@ -271,6 +287,11 @@ impl MessageExchange {
             }
         }
         self.write(slots, states, now_ms, out);
+        if self.speaks {
+            let width = out.speech.len().checked_div(slots.len()).unwrap_or(0);
+            self.write_speech(header.sim_time_ns, slots, states, width, out.speech);
+            out.achieved.copy_from_slice(&self.achieved);
+        }
     }
 
     fn begin_episode(&mut self, header: &MessageHeader) {
@@ -355,6 +376,8 @@ impl MessageExchange {
             denm: DenmService::default(),
             warning: None,
             perceived: Vec::new(),
+            sighted: None,
+            chosen: Vec::new(),
             relay: WarningRelay::default(),
             congestion: CongestionControl::new(self.config.congestion_control),
             map: LocalMap::default(),
@@ -556,7 +579,10 @@ impl MessageExchange {
             sender.bytes += message.bytes;
             match SendingService::of(message.message) {
                 SendingService::Cam => self.counts.cams += 1,
-                SendingService::Cpm => self.counts.cpms += 1,
+                SendingService::Cpm => {
+                    self.counts.cpms += 1;
+                    sender.cpm_bytes += message.bytes;
+                }
                 SendingService::Denm => self.counts.denms += 1,
                 SendingService::Vam => self.counts.vams += 1,
                 SendingService::Bsm => self.counts.bsms += 1,

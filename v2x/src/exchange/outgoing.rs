@@ -1,7 +1,7 @@
 //! What the services of a station send at a tick.
 
 use ipc_schema::{
-    config::{RoadsideService, V2xAwareness, V2xConfig, V2xListing},
+    config::{RoadsideService, V2xAwareness, V2xConfig, V2xInclusion, V2xListing},
     world::VehicleState,
 };
 use sim_core::geodesy::Projection;
@@ -238,7 +238,14 @@ impl StationTurn<'_> {
             V2xAwareness::Bsm => self.generate_bsm(tick, &composer),
         }
         if tick.perception.range_m > 0.0 {
-            let observer = Observer::of_vehicle(&self.radio.antenna, self.station.station, tick);
+            let observer = Observer::at(
+                &self.radio.antenna,
+                self.station.station,
+                tick.tick,
+                tick.states,
+                tick.obstacles,
+                tick.random,
+            );
             self.generate_cpm(tick, &composer, &observer, tick.perception);
         }
     }
@@ -298,7 +305,9 @@ impl StationTurn<'_> {
         observer: &Observer,
         spec: &PerceptionSpec,
     ) {
-        let perceived = observer.perceive(spec);
+        // The messages task has looked already.
+        let sighted = self.station.sighted.take();
+        let perceived = sighted.unwrap_or_else(|| observer.perceive(spec));
         if tick.config.listing == V2xListing::Separate {
             self.station.perceived = composer.own_view(spec, &perceived);
         }
@@ -314,9 +323,21 @@ impl StationTurn<'_> {
             })
             .collect();
         let gap_ns = self.gap_ns(SendingService::Cpm);
-        let Some(content) = self.station.cpm.check(tick.now_ns, &motions, gap_ns) else {
-            return;
+        let cpm = &mut self.station.cpm;
+        let content = match tick.config.inclusion {
+            // Roadside units keep to the rules.
+            _ if composer.kind == StationKind::ROADSIDE_UNIT => cpm.check(tick.now_ns, &motions, gap_ns),
+            V2xInclusion::Standard => cpm.check(tick.now_ns, &motions, gap_ns),
+            V2xInclusion::All => {
+                let all = (0..motions.len()).collect();
+                cpm.check_chosen(tick.now_ns, &motions, all, gap_ns)
+            }
+            V2xInclusion::Needed | V2xInclusion::Policy => {
+                let chosen = std::mem::take(&mut self.station.chosen);
+                cpm.check_chosen(tick.now_ns, &motions, chosen, gap_ns)
+            }
         };
+        let Some(content) = content else { return };
         let has_sensors = content.has_sensor_information;
         if let Some(cpm) = composer.cpm(spec, &perceived, &content.objects, has_sensors) {
             self.send(tick, composer, SendingService::Cpm, &cpm.encode(), &cpm.position);

@@ -35,20 +35,27 @@ pub struct Observer<'a> {
 }
 
 impl<'a> Observer<'a> {
-    /// A vehicle of the tick, by the antenna that it carries.
+    /// The vehicle that carries the antenna.
     #[must_use]
-    pub fn of_vehicle(antenna: &'a Antenna, station: u32, tick: &StationTick<'a>) -> Self {
-        let body = &tick.obstacles.bodies()[antenna.row as usize];
+    pub fn at(
+        antenna: &'a Antenna,
+        station: u32,
+        tick: u32,
+        states: &'a [VehicleState],
+        obstacles: &'a Obstacles,
+        random: &'a RadioRandom,
+    ) -> Self {
+        let body = &obstacles.bodies()[antenna.row as usize];
         Self {
             antenna,
             centre_m: body.centre_m,
             origin_m: body.world_from_local([body.half_m[0], 0.0]),
-            yaw_rad: tick.states[antenna.row as usize].yaw_rad,
+            yaw_rad: states[antenna.row as usize].yaw_rad,
             station,
-            tick: tick.tick,
-            states: tick.states,
-            obstacles: tick.obstacles,
-            random: tick.random,
+            tick,
+            states,
+            obstacles,
+            random,
         }
     }
 
@@ -112,6 +119,7 @@ impl<'a> Observer<'a> {
                 other.yaw_rad - yaw_rad,
             );
             Some(Perception {
+                row: *row,
                 object: (other.vehicle % 65_535) as u16,
                 position_body_m: [ahead + spec.position_std_m * ex, left + spec.position_std_m * ey],
                 velocity_body_mps: [

@@ -60,30 +60,23 @@ impl CpmService {
     /// Checks at `now_ns` whether a message is due for the objects that are perceived now; congestion control allows one every `dcc_ns`.
     /// A message that is returned counts as sent.
     pub fn check(&mut self, now_ns: u64, perceived: &[PerceivedMotion], dcc_ns: u64) -> Option<CpmContent> {
-        if self
-            .sent_ns
-            .is_some_and(|sent| now_ns - sent < dcc_ns.clamp(SHORTEST_NS, LONGEST_NS))
-        {
+        let objects = self.due(now_ns, perceived);
+        self.check_chosen(now_ns, perceived, objects, dcc_ns)
+    }
+
+    /// The same for a message with the objects at `objects`, whichever they are.
+    pub fn check_chosen(
+        &mut self,
+        now_ns: u64,
+        perceived: &[PerceivedMotion],
+        objects: Vec<usize>,
+        dcc_ns: u64,
+    ) -> Option<CpmContent> {
+        let gap_ns = dcc_ns.clamp(SHORTEST_NS, LONGEST_NS);
+        if self.sent_ns.is_some_and(|sent| now_ns - sent < gap_ns) {
             return None;
         }
-        let is_person = |object: &PerceivedMotion| object.kind == ObjectKind::Person;
-        let all_people = perceived
-            .iter()
-            .filter(|object| is_person(object))
-            .any(|person| self.is_left_out_for(person, now_ns, PEOPLE_NS));
-        let objects: Vec<usize> = (0..perceived.len())
-            .filter(|place| {
-                let object = &perceived[*place];
-                if is_person(object) {
-                    all_people
-                } else {
-                    self.is_due(object, now_ns)
-                }
-            })
-            .collect();
-        let has_sensor_information = self
-            .sensor_information_ns
-            .is_none_or(|sent| now_ns - sent >= SENSOR_INFORMATION_NS);
+        let has_sensor_information = self.is_sensor_information_due(now_ns);
         if objects.is_empty() && !has_sensor_information {
             return None;
         }
@@ -105,6 +98,43 @@ impl CpmService {
             objects,
             has_sensor_information,
         })
+    }
+
+    /// When the last message was sent, nanoseconds.
+    #[must_use]
+    pub fn sent_ns(&self) -> Option<u64> {
+        self.sent_ns
+    }
+
+    /// True if a message with sensor information is due.
+    #[must_use]
+    pub fn is_sensor_information_due(&self, now_ns: u64) -> bool {
+        self.sensor_information_ns
+            .is_none_or(|sent| now_ns - sent >= SENSOR_INFORMATION_NS)
+    }
+
+    /// When an object was included for the last time, nanoseconds, and how it moved.
+    #[must_use]
+    pub fn last_included(&self, object: u64) -> Option<(u64, MeasuredMotion)> {
+        let included = self.included.get(&object)?;
+        Some((included.included_ns, included.motion))
+    }
+
+    /// Places of the objects that the rules include.
+    fn due(&self, now_ns: u64, perceived: &[PerceivedMotion]) -> Vec<usize> {
+        let is_person = |object: &PerceivedMotion| object.kind == ObjectKind::Person;
+        let all_people = perceived
+            .iter()
+            .filter(|object| is_person(object))
+            .any(|person| self.is_left_out_for(person, now_ns, PEOPLE_NS));
+        let is_included = |place: &usize| {
+            let object = &perceived[*place];
+            match is_person(object) {
+                true => all_people,
+                false => self.is_due(object, now_ns),
+            }
+        };
+        (0..perceived.len()).filter(is_included).collect()
     }
 
     /// True if the object is new, or was not included for `longest_ns`.

@@ -13,6 +13,7 @@ from caraware.ipc.arrays import Float32Array
 from caraware.ipc.run_file import BlackoutPolicy, ConfigTable, RunFile, is_population, setting
 from caraware.tasks.contract import Sampling, Task
 from caraware.tasks.fields import Fields
+from caraware.tasks.messages import Messages, speech_width
 from caraware.tasks.table import task_of_run
 
 
@@ -23,6 +24,8 @@ class FaceSettings:
     task: Task
     tick_s: float
     fields: Fields
+    width: int
+    """Numbers of a row that a policy sees: of the fields, or in the messages task of what a station knows."""
     slots: int | None
     """Vehicles with a slot at a time; None in a scenario, which does not say."""
     episode_ticks: int
@@ -41,7 +44,8 @@ class FaceSettings:
         return cls(
             task=task,
             tick_s=setting(run, "run.tick_s", float),
-            fields=Fields.from_run(run),
+            fields=(fields := Fields.from_run(run)),
+            width=speech_width(task.actions.size) if isinstance(task, Messages) else fields.width,
             slots=_slots(config, is_population(run)),
             episode_ticks=setting(run, "episode.ticks", int),
             credit_ticks=1 if task.sampling is Sampling.EACH_TICK else max(1, window_ticks // 2),
@@ -55,7 +59,7 @@ class FaceSettings:
 
     def observation_space(self) -> Box:
         """Of one vehicle: f32 `[d]`."""
-        return Box(self.fields.low, 1.0, (self.fields.width,), np.float32)
+        return Box(-1.0 if isinstance(self.task, Messages) else self.fields.low, 1.0, (self.width,), np.float32)
 
     def action_space(self) -> Box:
         """Of one vehicle: f32 `[a]`, each in the range of the task's actions."""

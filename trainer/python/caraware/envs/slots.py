@@ -369,8 +369,8 @@ class Slots:
         observation = _padded(_array(obs, "observation"), n)
         if self.settings.dark_is_nan:
             np.nan_to_num(observation, copy=False)
-        if observation.shape[1] != self.settings.fields.width:
-            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file says {self.settings.fields.width}")
+        if observation.shape[1] != self.settings.width:
+            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file says {self.settings.width}")
         truth, gnss_m = _padded(_array(obs, "truth"), n), _padded(_array(obs, "gnss_m")[:, :2], n)
         if not mask.all():
             for rows in (observation, truth, gnss_m):
@@ -395,7 +395,7 @@ class Slots:
     def _end_of_run(self) -> Tick:
         """The tick without vehicles after the last tick of a run."""
         n, none = self.count, np.zeros(self.count, bool)
-        zeros = [np.zeros((n, width), np.float32) for width in (self.settings.fields.width, 4, 2)]
+        zeros = [np.zeros((n, width), np.float32) for width in (self.settings.width, 4, 2)]
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)
         ids = np.zeros(n, np.uint64)
         episode, rows = (self._runs + 1, 0), Rows(self.settings, *zeros)
@@ -442,13 +442,9 @@ class Slots:
 
 def _array(obs: Observation, name: str) -> Float32Array:
     """f32 `[n, …]` of a tick. Straight from shared memory where it lies there: a tensor on the way takes 20 µs."""
-    block = getattr(obs, "block", None)
-    if block is None:
-        numbers: Float32Array = getattr(obs, name).numpy()
-        return numbers
-    view = block.section(name)
-    array: Float32Array = np.frombuffer(memoryview(view), np.float32).reshape(view.shape)
-    return array
+    read = getattr(obs, "array", None)
+    numbers: Float32Array = getattr(obs, name).numpy() if read is None else read(name, np.float32)
+    return numbers
 
 
 def _padded(values: NDArray[Scalar], n: int, empty: int = 0) -> NDArray[Scalar]:

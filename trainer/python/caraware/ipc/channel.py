@@ -149,15 +149,15 @@ class Observation:
         """Stage of the curriculum, counted from 1; 0 without one, and in evaluations."""
         return self.block.stage
 
-    def _array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
-        """The array `name` in the shape that the extension knows; `scalar` names its type for the type checker."""
+    def array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+        """The section `name` in the shape that the extension knows; `scalar` names its type for the type checker."""
         view = self.block.section(name)
         return np.frombuffer(memoryview(view), dtype=scalar).reshape(view.shape)
 
     @cached_property
     def observation(self) -> Tensor:
         """f32 [n, d], normalised fields; what a policy may see."""
-        return read_only_tensor(self._array("observation", np.float32))
+        return read_only_tensor(self.array("observation", np.float32))
 
     @cached_property
     def images(self) -> Tensor:
@@ -169,7 +169,7 @@ class Observation:
         shape = self.block.image_shape
         if shape is None:
             raise RuntimeError("no images in the observations of this run: set `camera.observed`")
-        rows = self._array("images", np.uint8).reshape(-1, *shape)
+        rows = self.array("images", np.uint8).reshape(-1, *shape)
         return read_only_tensor(rows).permute(0, 3, 1, 2)
 
     @cached_property
@@ -180,22 +180,22 @@ class Observation:
     @cached_property
     def truth(self) -> Tensor:
         """f32 [n, 4]: x and y of the rear axle (m, world), yaw (rad), speed (m/s). For rewards and errors only."""
-        return read_only_tensor(self._array("truth", np.float32))
+        return read_only_tensor(self.array("truth", np.float32))
 
     @cached_property
     def gnss_m(self) -> Tensor:
         """f32 [n, 3]: newest raw GNSS fix, east, north and up (m, world); its x and y are the baseline."""
-        return read_only_tensor(self._array("gnss_m", np.float32))
+        return read_only_tensor(self.array("gnss_m", np.float32))
 
     @cached_property
     def gnss_geodetic(self) -> Float64Array:
         """f64 [n, 3]: the same fix as latitude, longitude (degrees) and altitude (m)."""
-        return self._array("gnss_geodetic", np.float64)
+        return self.array("gnss_geodetic", np.float64)
 
     @cached_property
     def gnss_quality(self) -> Float32Array:
         """f32 [n, 2]: the receiver's estimate of its horizontal error (m, 1σ of the distance), satellites in use."""
-        return self._array("gnss_quality", np.float32)
+        return self.array("gnss_quality", np.float32)
 
     @cached_property
     def imu(self) -> Tensor:
@@ -204,41 +204,41 @@ class Observation:
         Columns: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad). Frame and gravity are
         what `imu.convention` says; k is 1 for an IMU that samples once a tick or less often.
         """
-        return read_only_tensor(self._array("imu", np.float32))
+        return read_only_tensor(self.array("imu", np.float32))
 
     @cached_property
     def speed_steering(self) -> Tensor:
         """f32 [n, 2]: newest wheel speed (m/s) and steering-wheel angle (rad, positive to the left)."""
-        return read_only_tensor(self._array("speed_steering", np.float32))
+        return read_only_tensor(self.array("speed_steering", np.float32))
 
     @cached_property
     def sensors(self) -> UInt32Array:
         """u32 [n]: bits of the sensors that deliver (`caraware.ipc.layout.SENSOR_BITS`)."""
-        return self._array("sensors", np.uint32)
+        return self.array("sensors", np.uint32)
 
     @cached_property
     def vehicle(self) -> UInt32Array:
         """u32 [n]: dense index of the vehicle within its episode, 0xFFFFFFFF for an empty slot."""
-        return self._array("vehicle", np.uint32)
+        return self.array("vehicle", np.uint32)
 
     @cached_property
     def id_hash(self) -> UInt64Array:
         """u64 [n]: hash of the vehicle's SUMO id."""
-        return self._array("id_hash", np.uint64)
+        return self.array("id_hash", np.uint64)
 
     @cached_property
     def age_s(self) -> Float32Array:
         """f32 [n, 4]: age of the newest GNSS, IMU, speed-steering and LIDAR sample (s)."""
-        return self._array("age_s", np.float32)
+        return self.array("age_s", np.float32)
 
     @cached_property
     def episode_step(self) -> UInt32Array:
         """u32 [n]: ticks since the vehicle took the slot."""
-        return self._array("episode_step", np.uint32)
+        return self.array("episode_step", np.uint32)
 
     @cached_property
     def _flags(self) -> UInt32Array:
-        return self._array("flags", np.uint32)
+        return self.array("flags", np.uint32)
 
     def _flag(self, bit: int) -> BoolArray:
         """bool [n]: the slots whose flags have the bit."""
@@ -272,6 +272,27 @@ class Observation:
         return self._flag(_native.RESYNCHRONISED)
 
 
+class SpeakingObservation(Observation):
+    """One tick of the messages task: what a policy sees, and what it achieved, come from `v2x` (docs/messages.md).
+
+    `observation` is f32 [n, 8 + 15 c], what the station of each slot knows, 0 for one that cannot tell of anything:
+    the 8 numbers of a station (`SPEAKER_COLUMNS` of `ipc_schema::neighbours`) and the 15 of each of its c candidates
+    (`CANDIDATE_COLUMNS`), the nearest first. `truth` is f32 [n, 4], what the messages of the tick before have achieved,
+    for rewards and metrics only.
+    """
+
+    def array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+        """See `Observation.array`."""
+        section = {"observation": "speech", "truth": "achieved"}.get(name)
+        return super().array(name, scalar) if section is None else self.neighbours.array(section, scalar)
+
+    @cached_property
+    def valid(self) -> BoolArray:
+        """bool [n]: the slot holds a vehicle with a radio that has a fix of its place."""
+        speaks: BoolArray = self._flag(_native.VALID) & (self.array("observation", np.float32)[:, 0] > 0)
+        return speaks
+
+
 class Neighbours:
     """What the slots of an observation know from messages. n slots, k objects in each, the nearest first.
 
@@ -281,7 +302,8 @@ class Neighbours:
     def __init__(self, block: _native.ObservationBlock) -> None:
         self._block = block
 
-    def _array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+    def array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+        """The section `name`. Raises RuntimeError in a run without messages."""
         view = self._block.neighbours(name)
         if view is None:
             raise RuntimeError("no messages in this run: set `v2x.share` above 0")
@@ -294,27 +316,41 @@ class Neighbours:
         Columns: x, y (m, world, centre), velocity x, y (m/s, world), heading (rad), length, width (m), age (s), then
         standard deviations: position on each axis (m), velocity on each axis (m/s), heading (rad).
         """
-        return read_only_tensor(self._array("objects", np.float32))
+        return read_only_tensor(self.array("objects", np.float32))
 
     @cached_property
     def ids(self) -> UInt32Array:
         """u32 [n, k, 3]: its station (0: perceived), station heard from, 1 CAM, 2 CPM, 3 VAM, 4 BSM, 5 own sensors."""
-        return self._array("ids", np.uint32)
+        return self.array("ids", np.uint32)
 
     @cached_property
     def radio(self) -> UInt32Array:
         """u32 [n, 5]: 1 with a radio, objects known; messages sent, their bytes, and received in the tick before."""
-        return self._array("radio", np.uint32)
+        return self.array("radio", np.uint32)
 
     @cached_property
     def channel_load(self) -> Tensor:
         """f32 [n]: share of the tick before in which the radio found the channel busy."""
-        return read_only_tensor(self._array("channel_load", np.float32))
+        return read_only_tensor(self.array("channel_load", np.float32))
 
     @cached_property
     def vehicle(self) -> UInt32Array:
         """u32 [n]: dense index of the vehicle, as in the observation."""
-        return self._array("vehicle", np.uint32)
+        return self.array("vehicle", np.uint32)
+
+    @cached_property
+    def speech(self) -> Tensor:
+        """f32 [s, i]: what the policy of the messages task sees; s and i are 0 in other tasks."""
+        return read_only_tensor(self.array("speech", np.float32))
+
+    @cached_property
+    def achieved(self) -> Tensor:
+        """f32 [s, 4], of the messages task: what the messages of the tick before have achieved.
+
+        Columns: seconds for which others newly know what the slot's CPM listed, bytes of that message, road users
+        within `v2x.awareness_range_m` that the slot knows now, all road users within that range.
+        """
+        return read_only_tensor(self.array("achieved", np.float32))
 
 
 class _Answer(NamedTuple):
@@ -362,6 +398,10 @@ class Channel:
     def _hold(self, attachment: _native.Attachment) -> None:
         self._attachment = attachment
         self.run: RunFile = json.loads(attachment.run_json)
+        speaks = setting(self.run, "task.kind", str) == "messages"
+        self._tick_of: Callable[[_native.ObservationBlock], Observation] = (
+            SpeakingObservation if speaks else Observation
+        )
         self._answer: _Answer | None = None
 
     def in_environment(self, index: int, first_tick: int | None = None) -> Channel:
@@ -394,7 +434,7 @@ class Channel:
             # Nearly all ticks neither begin nor end an episode, and half a microsecond counts here.
             if block.episode_last or block.episode != self._starts.newest:
                 self._starts.note(block)
-        return [Observation(block) for block in blocks]
+        return [self._tick_of(block) for block in blocks]
 
     def lease(self) -> _native.Lease:
         """The observations one by one, each lent until the next is taken: a microsecond from publish to tensor.
@@ -499,24 +539,28 @@ class Channel:
     def publish_actions(
         self, observation: Observation, actions: FloatArray, policy_version: int = 0, *, now: bool = True
     ) -> None:
-        """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
+        """Actions of a task whose simulation waits for those of every tick and makes the next one with them.
 
-        f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of
-        every tick and makes the next one with them. What is no number or out of range is refused: the last valid action
-        of that vehicle is held.
+        Driving: f32 [n, 2], steering (left is positive) and acceleration, each in -1 ... 1, a row for every slot; rows
+        of empty slots are not read. What is no number or out of range is refused: the last valid action of that vehicle
+        is held. Messages: f32 [n, `v2x.candidates`]; a candidate whose number is above 0 is listed.
 
         The newest actions are sent again while no tick comes, because a simulator that died may have lost them. Without
         `now` they are only sent then: another learner has answered the tick, as far as is known.
         """
         rows = np.ascontiguousarray(actions, dtype=np.float32)
-        if rows.shape != (observation.block.slots, 2):
-            raise ValueError(f"actions of shape {rows.shape}, the task takes ({observation.block.slots}, 2)")
+        speaks = self._tick_of is SpeakingObservation
+        expected = (observation.block.slots, setting(self.run, "v2x.candidates", int) if speaks else 2)
+        if rows.shape != expected:
+            raise ValueError(f"actions of shape {rows.shape}, the task takes {expected}")
         self._answer = _Answer(observation, rows.tobytes(), policy_version, time.monotonic())
         if now:
             self._send(self._answer)
 
     def _send(self, answer: _Answer) -> None:
-        self._attachment.publish_predictions(answer.observation.block, answer.rows, 2, answer.policy_version)
+        block = answer.observation.block
+        columns = len(answer.rows) // max(1, block.slots * np.dtype(np.float32).itemsize)
+        self._attachment.publish_predictions(block, answer.rows, columns, answer.policy_version)
 
     def _answer_again(self, answer: _Answer) -> None:
         """Send the newest actions again if no tick has come for long: a simulator that died may have lost them."""
@@ -531,6 +575,10 @@ class Channel:
     def lag_ticks(self) -> int:
         """Ticks that the traffic is ahead of the newest one consumed."""
         return self._attachment.lag_ticks()
+
+    def actor_lag_ticks(self) -> int:
+        """Ticks that the process that waits for actions has finished beyond the newest one consumed."""
+        return self._attachment.actor_lag_ticks()
 
     def done(self) -> None:
         """All work is done: the process may end."""

@@ -178,10 +178,13 @@ class Channel(Protocol):
     def publish_actions(
         self, observation: Any, actions: FloatArray, policy_version: int = 0, *, now: bool = True
     ) -> None:
-        """Send f32 `[n, 2]` actions for the tick of `observation`, at once or, without `now`, if no tick comes."""
+        """Send f32 `[n, a]` actions for the tick of `observation`, at once or, without `now`, if no tick comes."""
 
     def lag_ticks(self) -> int:
         """Ticks that the traffic is ahead of the newest one consumed."""
+
+    def actor_lag_ticks(self) -> int:
+        """Ticks that the process that waits for actions has finished beyond the newest one consumed."""
 
     def done(self) -> None:
         """Say that all work is done, so that the run may end."""

@@ -1,4 +1,6 @@
-"""A network for `observation.fields = "driver"`: each group of fields has an encoder, whose outputs are pooled.
+"""Networks for rows of alike things: those of `observation.fields = "driver"`, and the candidates of the messages task.
+
+`GroupedNetwork` is for `observation.fields = "driver"`: each group of fields has an encoder, whose outputs are pooled.
 
 The road users, junctions, traffic lights and persons around a hero are sets of alike things. One small network encodes
 each member of a set, and the maximum over the members is what the layers above see: so the policy treats the third
@@ -10,6 +12,8 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+
+from caraware import _native
 
 EGO = 16
 """Fields of the hero itself and of its route: the preset "driving"."""
@@ -85,3 +89,40 @@ class GroupedNetwork(nn.Module):
         seen = torch.cat(encoded, 1).relu()
         out: Tensor = self.trunk(seen.view(len(rows), -1))
         return out
+
+
+class CandidateNetwork(nn.Module):
+    """Rows `[b, inputs]` of the messages task to `[b, outputs]`: a number for each candidate, or one for the station.
+
+    One network judges each candidate by its own numbers, those of the station, and the maximum over all candidates: so
+    the policy treats the third nearest object as it treats the first. Raises `ValueError` for rows of other numbers.
+    """
+
+    def __init__(self, inputs: int, outputs: int, hidden: tuple[int, ...]) -> None:
+        super().__init__()
+        station, columns = _native.SPEAKER_COLUMNS, _native.CANDIDATE_COLUMNS
+        self.candidates = (inputs - station) // columns
+        if self.candidates < 1 or (inputs - station) % columns or outputs not in (1, self.candidates):
+            raise ValueError(f'rows of {inputs} numbers: this network is for `task.kind` = "messages"')
+        self.station, self.columns = station, columns
+        self.encoder = GroupEncoder(columns)
+        widths = (columns + station + ENCODED, *hidden)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            layers += [nn.Linear(before, after), nn.Tanh()]
+        head = nn.Linear(widths[-1], 1)
+        # A policy begins near 0 for every candidate.
+        nn.init.orthogonal_(head.weight, 0.01)
+        nn.init.zeros_(head.bias)
+        self.judge = nn.Sequential(*layers, head)
+        self.is_value = outputs == 1 and self.candidates > 1
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """See the class."""
+        station = rows[:, : self.station]
+        candidates = rows[:, self.station :].reshape(len(rows), self.candidates, self.columns)
+        around = torch.cat([station, self.encoder(candidates)], 1)
+        wide = around.unsqueeze(1).expand(-1, self.candidates, -1)
+        judged: Tensor = self.judge(torch.cat([candidates, wide], 2)).squeeze(2)
+        # What a station achieves is the sum over those that are there.
+        return (judged * candidates[:, :, 0]).sum(1, keepdim=True) if self.is_value else judged

@@ -541,8 +541,9 @@ class Ppo:
         policy, value = figures.policy, figures.value
         # With several actions for an observation they lie side by side.
         actions = batch.action.reshape(-1, self.task.actions.size)
-        action_mean_x, action_mean_y = actions.mean(0).tolist()
-        action_std_x, action_std_y = actions.std(0, correction=0).tolist()
+        # An action of more numbers shows its first two, one of a single number that one twice.
+        x, y = 0, min(1, self.task.actions.size - 1)
+        action_mean, action_std = actions.mean(0).tolist(), actions.std(0, correction=0).tolist()
         return UpdateStats(
             policy_loss=policy.loss,
             value_loss=value.loss,
@@ -557,10 +558,10 @@ class Ppo:
             return_mean=figures.value_target.mean().item(),
             return_std=figures.value_target.std(correction=0).item(),
             reward_mean=figures.reward.mean().item(),
-            action_mean_x=action_mean_x,
-            action_mean_y=action_mean_y,
-            action_std_x=action_std_x,
-            action_std_y=action_std_y,
+            action_mean_x=action_mean[x],
+            action_mean_y=action_mean[y],
+            action_std_x=action_std[x],
+            action_std_y=action_std[y],
             action_outside=(actions.abs() > 1).any(1).float().mean().item(),
             explained_variance=_explained_variance(figures),
             policy_gradient_norm=policy.gradient_norm,

@@ -176,7 +176,14 @@ class Evaluation:
         """`metric` names what is compared. With `lanes` there is a filter with a map; `supervised`: its values come."""
         self._metric = metric
         self._baselines = Baselines(noise, lanes) if noise else None
-        present = {"ekf": noise, "rts": noise, "map_ekf": noise and lanes, "supervised": supervised}
+        has_reference = any(other.reference_for == metric for other in _native.METRICS)
+        present = {
+            "raw_gnss": has_reference,
+            "ekf": noise,
+            "rts": noise,
+            "map_ekf": noise and lanes,
+            "supervised": supervised,
+        }
         missing = [name for name, given in present.items() if not given]
         self._known = [name for name in ESTIMATORS if name not in missing]
         self._further: dict[str, Mean] = {}

@@ -18,7 +18,8 @@ from caraware.run.trips import TripCounts
 from caraware.tasks.contract import Sampling
 
 AWAITED_LAG_TICKS = 4
-"""In lock-step SUMO is two ticks ahead of the one that is consumed; farther ahead, the tick was answered before."""
+"""In lock-step the process that waits for actions is two ticks ahead of the one that is consumed, at most; farther
+ahead, the tick was answered before."""
 
 
 class Environment:
@@ -43,7 +44,7 @@ class Environment:
         Once the trainer has caught up, every tick is awaited.
         """
         if self._catches_up:
-            self._catches_up = self.channel.lag_ticks() > AWAITED_LAG_TICKS
+            self._catches_up = self.channel.actor_lag_ticks() > AWAITED_LAG_TICKS
         return not self._catches_up
 
     def estimates_m(self, obs: Observation) -> Float32Array | None:

@@ -52,6 +52,9 @@ class EvaluationPhase:
                 self._evaluation = Evaluation(self._headline.name)
             if (past := self._followed.add(obs)) is not None:
                 self._evaluation.add(past, {"ppo": past.metrics[self._headline.name]})
+                for name, of_policy in past.metrics.items():
+                    if name != self._headline.name:
+                        self._evaluation.add_further(name, {"ppo": of_policy})
             self._newest_tick = obs.tick
             return
         if self._evaluation is None:

@@ -24,8 +24,7 @@ from caraware.run.learner import Learner
 from caraware.run.report_part import write_part
 from caraware.run.sample_count import SampleCount
 from caraware.run.stream_position import StreamPosition
-from caraware.run.trips import sum_of
-from caraware.tasks.contract import Sampling
+from caraware.run.trips import has_trips, sum_of
 
 log = logging.getLogger(__name__)
 
@@ -362,7 +361,7 @@ class TrainingLoop:
             "untrained_env_steps": env_steps - self._trained_steps(),
             "dropped": self._metrics.dropped.report(),
         }
-        if self._task.sampling is Sampling.EACH_TICK and self._learner:
+        if has_trips(self._task) and self._learner:
             entries["trips"] = {
                 phase: sum_of(getattr(environment.trips, phase) for environment in self._environments)
                 for phase in ("training", "evaluation")

@@ -23,6 +23,7 @@ from caraware.report.statistics import mean_interval
 from caraware.run.config import RunConfig
 from caraware.run.followed import FollowedTicks
 from caraware.run.loop import RECEIVE_TIMEOUT_S
+from caraware.run.trips import has_trips
 from caraware.tasks.contract import Sampling
 from caraware.tasks.ends import name_of
 from caraware.tasks.localisation import Localisation
@@ -184,8 +185,8 @@ class Scoreboard:
         partial.rename(file)
 
 
-class DrivingScoreboard(Scoreboard):
-    """The headline metric of a driving policy, which is measured a tick later; no filter drives beside it."""
+class FollowedScoreboard(Scoreboard):
+    """The headline metric of a policy whose world waits for it, measured a tick later; no filter runs beside it."""
 
     def __init__(self, run: RunFile, config: RunConfig, tally: PlayTally) -> None:
         super().__init__(run, config, tally)
@@ -237,8 +238,8 @@ class PlayLoop:
     ) -> None:
         self._channel, self._config, self._policy, self._stop_requested = channel, config, policy, stop_requested
         self._live = config.run_dir / LIVE
-        self._drives = config.task.sampling is Sampling.EACH_TICK
-        scoreboard = DrivingScoreboard if self._drives else Scoreboard
+        self._waits = config.task.sampling is Sampling.EACH_TICK
+        scoreboard = FollowedScoreboard if self._waits else Scoreboard
         self._board = scoreboard(channel.run, config, PlayTally.read(self._live))
         self._shown_at = -math.inf
         self._predictor = policy.predictor(config.dark_is_nan, evaluations_alone=False)
@@ -263,7 +264,7 @@ class PlayLoop:
         updates = self._policy.updates
         for obs, predicted_m in zip(ticks, self._predictor.predict_m({0: ticks})[0], strict=True):
             self._board.add(obs, predicted_m)
-            if self._drives:
+            if self._waits:
                 # Sent again while no tick comes: a simulator that died may have lost them.
                 self._channel.publish_actions(obs, predicted_m.detach().numpy(), updates)
                 self._channel.consumed(obs.tick)
@@ -299,7 +300,7 @@ class PlayLoop:
             "evaluation_seeds": len(tally.episodes),
             "episodes": tally.episodes,
         }
-        if self._drives:
+        if has_trips(self._config.task):
             part["trips"] = tally.ends
         metric = self._board.metric.name
         for name in self._board.estimators:

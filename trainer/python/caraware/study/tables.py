@@ -26,6 +26,9 @@ FUSION_EVALUATIONS = 5
 COOPERATION_EVALUATIONS = 5
 COOPERATION_SHARES = (0.1, 0.3, 0.5, 1.0)
 """Shares of the vehicles with a radio."""
+MESSAGE_SHARES = (0.3, 1.0)
+"""Shares of the vehicles with a radio, where what to say is learnt."""
+MESSAGE_RULES = ("standard", "all", "needed")
 DEFAULT_NOISE = ("gnss.correlated_std_m=0.0", "blackout.enabled=false")
 SENSORS: Mapping[str, tuple[str, ...]] = {"default_noise": DEFAULT_NOISE, "faults": ()}
 """Settings beside the preset `fusion`, which has a slow error of fixes and blackouts."""
@@ -162,9 +165,33 @@ def cooperation(options: Options) -> Measured:
     return measured
 
 
+def messages(options: Options) -> Measured:
+    """What stations know, and what they send, by a learnt policy and by rules: whole runs, at two shares of radios.
+
+    The rules run on the evaluation seeds of the policy beside them.
+    """
+    measured: Measured = {}
+    for share in MESSAGE_SHARES:
+        for seed in options.seeds:
+            own = (f"run.seed={seed}", f"v2x.share={share}", "episode.evaluation_interval=0")
+            reports = {"policy": whole_run(options, f"messages-{share}-policy-{seed}", "messages", own)}
+            for rule in MESSAGE_RULES:
+                settings = (*own, f"v2x.inclusion={rule}", "episode.training_episodes=1", "episode.ticks=1")
+                reports[rule] = whole_run(options, f"messages-{share}-{rule}-{seed}", "messages", settings)
+            for name, report in reports.items():
+                for metric in ("awareness_percent", "message_kbitps"):
+                    value = float(report["trainer"][f"ppo_mean_{metric}"])
+                    measured.setdefault(f"{share}.{name}.{metric}", []).append(value)
+        for metric in ("awareness_percent", "message_kbitps"):
+            pairs = zip(measured[f"{share}.policy.{metric}"], measured[f"{share}.standard.{metric}"], strict=True)
+            measured[f"{share}.policy_by_standard.{metric}"] = [policy / standard for policy, standard in pairs]
+    return measured
+
+
 TABLES: Mapping[str, Table] = {
     "filters": Table("docs/baselines.md", "the filters with and without a map", filters),
     "cooperation": Table("docs/cooperation.md", "localisation with others' help", cooperation),
+    "messages": Table("docs/messages.md", "what to tell others, learnt and by rules", messages),
     "town": Table("docs/baselines.md", "policy and regression by as many samples and steps", town),
     "fusion": Table("docs/fusion.md", "the learned estimator beside the filter that it starts as", fusion),
     "overhead": Table("docs/benchmarks.md", "co-simulation beside bare `sumo`", overhead),

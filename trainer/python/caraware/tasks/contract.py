@@ -70,7 +70,9 @@ class TaskRows:
     observation: Tensor
     """f32 `[n, d]`, normalised."""
     truth: Tensor
-    """f32 `[n, 4]`: x and y of the rear axle (m, world), yaw (rad), speed (m/s)."""
+    """f32 `[n, 4]`: x and y of the rear axle (m, world), yaw (rad), speed (m/s).
+
+    In the messages task: what the messages of the tick before have achieved (`caraware.tasks.messages`)."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,10 @@ class TaskStep(TaskRows):
 
     outcome: TaskOutcome | None = None
     """None for a task that samples `WHEN_FULL`: what follows does not depend on its actions."""
+
+
+class OutcomeMissingError(ValueError):
+    """The task rewards what an action did: a step without its outcome has no reward."""
 
 
 class Task(Protocol):

@@ -13,7 +13,15 @@ from caraware.ipc.arrays import FloatArray
 from caraware.ipc.run_file import ConfigError, RunFile, config_table, setting
 from caraware.ipc.stream import MeasuredTick
 from caraware.tasks import ends
-from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep
+from caraware.tasks.contract import (
+    ActionSpec,
+    EndKind,
+    EndReason,
+    OutcomeMissingError,
+    Sampling,
+    TaskOutcome,
+    TaskStep,
+)
 from caraware.tasks.fields import Fields
 from caraware.tasks.foresight import HORIZON_S, Around
 from caraware.tasks.metrics import metrics_of
@@ -30,10 +38,6 @@ WAITING_COST, WAITS_MPS = 0.02, 1.0
 """Of a tick slower than that: as much as 20 cm of progress."""
 CAREFUL_END_COST = 15.0
 """Of an end of its own other than an arrival, by `careful_reward`."""
-
-
-class OutcomeMissingError(ValueError):
-    """The driving task rewards what an action did: a step without its outcome has no reward."""
 
 
 ACTIONS = ActionSpec(

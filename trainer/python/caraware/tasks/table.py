@@ -7,11 +7,13 @@ from caraware.tasks.contract import Task
 from caraware.tasks.driving import Driving
 from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
+from caraware.tasks.messages import Messages
 
 TASKS: Mapping[str, Callable[[RunFile], Task]] = {
     "localisation": Localisation.from_run,
     "driving": Driving.from_run,
     "lane": LanePosition.from_run,
+    "messages": Messages.from_run,
 }
 """By `task.kind`: reads the task of a run out of its run file."""
 

@@ -197,6 +197,8 @@ impl StreetRun {
             radio: &mut block.radio,
             channel_load: &mut block.channel_load,
             vehicle: &mut block.vehicle,
+            speech: &mut [],
+            achieved: &mut [],
         };
         self.exchange
             .receive(&tick.header, &tick.slots, &tick.states, &mut sections);

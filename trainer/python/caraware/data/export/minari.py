@@ -30,6 +30,7 @@ from caraware.tasks.contract import Task, TaskOutcome, TaskRows, TaskStep
 from caraware.tasks.driving import Driving
 from caraware.tasks.ends import END_NAMES, name_of
 from caraware.tasks.fields import Fields
+from caraware.tasks.localisation import Localisation
 from caraware.tasks.table import task_of_run
 
 VERSION = "0.5.4"
@@ -237,10 +238,17 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _task(recording: Recording) -> Task:
+    """The task of the run. Raises `RecordingError` for one whose rewards do not follow from what was published."""
     try:
-        return task_of_run(recording.run)
+        task = task_of_run(recording.run)
     except ConfigError as error:
         raise RecordingError(f"{recording.path}: {error}; {error.help}") from error
+    if not isinstance(task, Driving | Localisation):
+        raise RecordingError(
+            f"{recording.path} is a run of the task {task.name!r}: Minari's data sets are written of the tasks "
+            "'localisation' and 'driving'"
+        )
+    return task
 
 
 def _spaces(recording: Recording) -> Mapping[str, Mapping[str, Any]]:

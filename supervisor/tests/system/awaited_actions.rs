@@ -1,4 +1,4 @@
-//! Our PPO in the driving task: whichever process is killed, replaced or stopped, the run learns the same.
+//! Our PPO in the tasks whose world waits for actions: whichever process is killed, replaced or stopped, the run learns the same.
 
 use std::process::{Child, Stdio};
 
@@ -6,33 +6,71 @@ use crate::common::{Workplace, text, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Two worlds of four heroes each, and an update every 300 samples, which are 38 ticks.
-const SMALL: [&str; 18] = [
+/// A preset of such a task, and what its runs have.
+struct WaitingWorld {
+    preset: &'static str,
+    /// Two small worlds, and an update every 300 samples.
+    settings: &'static [&'static str],
+    /// Simulators that die, in order, and the process that waits for actions.
+    victims: [&'static str; 3],
+    actor: &'static str,
+    /// Key of the headline metric's mean.
+    mean: &'static str,
+    /// What the actions have led to, of a report.
+    achieved: fn(&Value) -> Value,
+}
+
+const SMALL: [&str; 13] = [
     "run.envs=2",
-    "traffic.heroes=4",
     "traffic.others=3",
     "traffic.pedestrians=2",
-    "task.time_limit_s=10",
     "episode.ticks=110",
     "episode.training_episodes=6",
     "episode.evaluation_interval=2",
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
-    "trainer.network=mlp",
-    "trainer.hidden=[16]",
     "trainer.horizon=300",
     "trainer.batch_size=150",
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",
-    "observation.fields=driving",
     "fanout.enabled=false",
 ];
 
-fn arguments<'a>(name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
-    ["train", "driving", "--name", name]
+/// Four heroes in each world: 300 samples are 38 ticks.
+const DRIVING: WaitingWorld = WaitingWorld {
+    preset: "driving",
+    settings: &[
+        "traffic.heroes=4",
+        "task.time_limit_s=10",
+        "trainer.network=mlp",
+        "trainer.hidden=[16]",
+        "observation.fields=driving",
+    ],
+    victims: ["/sim-core", "/traffic-bridge", "/sensor-daemon"],
+    actor: "/sim-core",
+    mean: "ppo_mean_progress_mps",
+    achieved: |report| report["dynamics"]["heroes"].clone(),
+};
+
+/// Four stations in each world.
+const MESSAGES: WaitingWorld = WaitingWorld {
+    preset: "messages",
+    settings: &["traffic.cavs=4", "trainer.hidden=[16]"],
+    victims: ["/v2x", "/traffic-bridge", "/sensor-daemon"],
+    actor: "/v2x",
+    mean: "ppo_mean_awareness_percent",
+    achieved: |report| {
+        let [one, other] = [0, 1].map(|index: usize| &report["environments"][index]["v2x"]);
+        let other = [&other["neighbours_hash"], &other["speech"]];
+        serde_json::json!([one["neighbours_hash"], one["speech"], one["cpms"], other])
+    },
+};
+
+fn arguments<'a>(world: &WaitingWorld, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let settings = SMALL.iter().chain(world.settings).chain(more);
+    ["train", world.preset, "--name", name]
         .into_iter()
-        .chain(settings)
+        .chain(settings.flat_map(|setting| ["--set", setting]))
         .collect()
 }
 
@@ -48,8 +86,8 @@ fn learnt(workplace: &Workplace, name: &str) -> String {
     format!("{} {}", newest.trim(), hasher.finalize().to_hex())
 }
 
-/// What a disturbed run has in common with one that was not: observations, trips, samples, evaluations, parameters.
-fn outcome(workplace: &Workplace, name: &str) -> Value {
+/// What a disturbed run has in common with one that was not: observations, what was achieved, samples, evaluations, parameters.
+fn outcome(world: &WaitingWorld, workplace: &Workplace, name: &str) -> Value {
     let report = workplace.report(name);
     assert_eq!(report["result"], "completed", "{name}");
     let evaluations = report["trainer"]["evaluations"].as_array().unwrap();
@@ -58,8 +96,8 @@ fn outcome(workplace: &Workplace, name: &str) -> Value {
         "hash": report["observation_hash"],
         "env_steps": report["env_steps"],
         "lost": [report["lost_ticks"], report["duplicated_ticks"]],
-        "heroes": report["dynamics"]["heroes"],
-        "evaluations": evaluations.iter().map(|each| each["ppo_mean_progress_mps"].clone()).collect::<Vec<_>>(),
+        "achieved": (world.achieved)(&report),
+        "evaluations": evaluations.iter().map(|each| each[world.mean].clone()).collect::<Vec<_>>(),
     })
 }
 
@@ -94,26 +132,52 @@ fn wait_for_checkpoint(workplace: &Workplace, name: &str, updates: u32, run: &mu
 }
 
 #[test]
-fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
+fn heroes_drive_as_if_nothing_had_happened() {
+    let (expected, played) = disturb(&DRIVING);
+    assert!(expected["achieved"]["episodes"].as_u64().unwrap() >= 8, "{expected:#}");
+    assert!(
+        !played["trainer"]["trips"].as_object().unwrap().is_empty(),
+        "{played:#}"
+    );
+}
+
+#[test]
+fn stations_speak_as_if_nothing_had_happened() {
+    let (expected, played) = disturb(&MESSAGES);
+    assert!(expected["achieved"][2].as_u64().unwrap() >= 100, "{expected:#}");
+    assert!(
+        expected["achieved"][1]["told_s"].as_f64().unwrap() > 0.0,
+        "{expected:#}"
+    );
+    assert!(
+        played["v2x"]["speech"]["station_ticks"].as_u64().unwrap() > 0,
+        "{played:#}"
+    );
+    assert!(played["trainer"]["trips"].is_null(), "{played:#}");
+}
+
+/// Kills learners and simulators of a run, hands it over, stops and resumes it, and plays what it learnt. Each ends as if nothing had
+/// happened. Returns the outcome and the report of the play.
+fn disturb(world: &WaitingWorld) -> (Value, Value) {
     let workplace = Workplace::new();
-    workplace.succeed(&arguments("whole", &[]));
-    let expected = outcome(&workplace, "whole");
+    workplace.succeed(&arguments(world, "whole", &[]));
+    let expected = outcome(world, &workplace, "whole");
     assert_eq!(expected["lost"], serde_json::json!([0, 0]));
     assert!(expected["evaluations"].as_array().unwrap().len() >= 2, "{expected:#}");
-    assert!(expected["heroes"]["episodes"].as_u64().unwrap() >= 8, "{expected:#}");
 
     // By SIGKILL: each simulator once, the learner alone, and in the end a simulator at the same time as the learner.
     let mut run = start(
         &workplace,
-        &arguments("killed", &["run.real_time_factor=6"]),
+        &arguments(world, "killed", &["run.real_time_factor=6"]),
         "killed.log",
     );
+    let [first, second, third] = world.victims;
     let victims: [(u32, &[&str]); 5] = [
-        (1, &["/sim-core"]),
+        (1, &[first]),
         (2, &["caraware.train"]),
-        (3, &["/traffic-bridge"]),
-        (5, &["/sensor-daemon"]),
-        (7, &["/sim-core", "caraware.train"]),
+        (3, &[second]),
+        (5, &[third]),
+        (7, &[world.actor, "caraware.train"]),
     ];
     for (updates, words) in victims {
         wait_for_checkpoint(&workplace, "killed", updates, &mut run);
@@ -128,12 +192,12 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     assert!(said.contains("a successor continues"), "{said}");
     let again = said.matches("the simulation is made again from tick").count();
     assert_eq!(again, 4, "{said}");
-    assert_eq!(outcome(&workplace, "killed"), expected);
+    assert_eq!(outcome(world, &workplace, "killed"), expected);
 
     // A planned handover to a successor of the same kind.
     let mut run = start(
         &workplace,
-        &arguments("handed", &["run.real_time_factor=6"]),
+        &arguments(world, "handed", &["run.real_time_factor=6"]),
         "handed.log",
     );
     wait_for_checkpoint(&workplace, "handed", 2, &mut run);
@@ -144,16 +208,20 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
         "{}",
         std::fs::read_to_string(workplace.path().join("handed.log")).unwrap()
     );
-    assert_eq!(outcome(&workplace, "handed"), expected);
+    assert_eq!(outcome(world, &workplace, "handed"), expected);
 
     // Stopped in its second half, then resumed.
-    let mut run = start(&workplace, &arguments("cut", &["run.real_time_factor=6"]), "cut.log");
+    let mut run = start(
+        &workplace,
+        &arguments(world, "cut", &["run.real_time_factor=6"]),
+        "cut.log",
+    );
     wait_for_checkpoint(&workplace, "cut", 4, &mut run);
     kill_process(Pid::from_child(&run), Signal::INT).unwrap();
     assert_eq!(run.wait().unwrap().code(), Some(130));
     let output = workplace.succeed(&["train", "--resume", "cut", "--set", "run.real_time_factor=0"]);
     assert_eq!(workplace.report("cut")["result"], "completed", "{}", text(&output));
-    let resumed = outcome(&workplace, "cut");
+    let resumed = outcome(world, &workplace, "cut");
     for key in ["learnt", "env_steps", "lost", "evaluations"] {
         assert_eq!(resumed[key], expected[key], "{key}");
     }
@@ -162,11 +230,7 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     // What was learnt is played, on other seeds.
     workplace.succeed(&["play", "whole", "--name", "played", "--episodes", "4"]);
     let played = workplace.report("played");
-    assert!(played["trainer"]["ppo_mean_progress_mps"].is_number(), "{played:#}");
-    assert!(
-        !played["trainer"]["trips"].as_object().unwrap().is_empty(),
-        "{played:#}"
-    );
+    assert!(played["trainer"][world.mean].is_number(), "{played:#}");
 
     // The same with simulators that die.
     let paced = ["--episodes", "4", "--set", "run.real_time_factor=4"];
@@ -176,7 +240,7 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
         "replayed.log",
     );
     let live = workplace.path().join("runs/replayed/live.json");
-    for (episode, word) in [(0, "/sim-core"), (1, "/traffic-bridge"), (2, "/sensor-daemon")] {
+    for (episode, word) in (0..).zip(world.victims) {
         until(&mut run, "an episode", || {
             let live: Value = serde_json::from_str(&std::fs::read_to_string(&live).ok()?).ok()?;
             (live["table"]["episode"].as_u64()? >= episode).then_some(())
@@ -193,4 +257,5 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     assert_eq!(again["trainer"]["trips"], played["trainer"]["trips"]);
     assert_eq!(again["trainer"]["episodes"], played["trainer"]["episodes"]);
     workplace.assert_nothing_left();
+    (expected, played)
 }
