@@ -24,8 +24,9 @@ use crate::{
         bsm::BsmService,
         cam::CamService,
         congestion::CongestionControl,
-        cpm::CpmService,
+        cpm::{CpmService, ObjectKind, PerceivedMotion},
         denm::{DenmContent, DenmKind, DenmService, REPETITION_NS, VALIDITY_NS},
+        edge::{FusedMap, FusedObject},
         relay::WarningRelay,
         turn,
         vam::VamService,
@@ -164,6 +165,8 @@ pub struct Station {
     pub sighted: Option<Vec<Perception>>,
     /// Places of the objects among those that its next message lists, ascending, where they are chosen.
     pub chosen: Vec<usize>,
+    /// The map of an edge service.
+    pub edge: FusedMap,
     /// Warnings of others that a roadside unit has yet to send once more.
     pub relay: WarningRelay,
     /// Congestion control.
@@ -225,6 +228,10 @@ pub struct Perception {
     pub size_m: [f64; 2],
     /// It is a person.
     pub is_person: bool,
+    /// Standard deviation of the place on each axis, metres.
+    pub position_std_m: f64,
+    /// Standard deviation of the velocity on each axis, m/s.
+    pub speed_std_mps: f64,
 }
 
 impl Perception {
@@ -448,7 +455,7 @@ impl MessageComposer<'_> {
     /// What the station's own sensors perceive, as others would know it from a message, and the point that it is measured from: with the
     /// station's name and without a size.
     #[must_use]
-    pub fn own_view(&self, spec: &PerceptionSpec, perceived: &[Perception]) -> Vec<KnownObject> {
+    pub fn own_view(&self, perceived: &[Perception]) -> Vec<KnownObject> {
         let Self { own, now_ns, .. } = *self;
         let own_std_m = own.accuracy_m.map_or(UNKNOWN_POSITION_M, |accuracy| {
             (accuracy / std::f64::consts::SQRT_2) as f32
@@ -480,14 +487,45 @@ impl MessageComposer<'_> {
                 size_m: object.size_m.map(|value| value as f32),
                 measured_ms: (now_ns / 1_000_000) as i64,
                 deviations: [
-                    libm::hypotf(own_std_m, spec.position_std_m as f32),
-                    spec.speed_std_mps as f32,
+                    libm::hypotf(own_std_m, object.position_std_m as f32),
+                    object.speed_std_mps as f32,
                     UNKNOWN_HEADING_RAD,
                 ],
                 ..reference
             }
         });
         std::iter::once(reference).chain(objects).collect()
+    }
+
+    /// An object of the map of an edge service as if the station perceived it.
+    #[must_use]
+    pub fn perception_of(&self, object: &FusedObject) -> Perception {
+        let (own, origin_m) = (self.own, self.own.front_m(self.size));
+        let offset_m = [0, 1].map(|axis: usize| object.position_m[axis] - origin_m[axis]);
+        Perception {
+            row: u32::MAX,
+            object: object.number,
+            position_body_m: rotate(offset_m, -own.heading_rad),
+            velocity_body_mps: rotate(object.velocity_mps, -own.heading_rad),
+            turn_rad: object.heading_rad - own.heading_rad,
+            size_m: object.size_m.map(f64::from),
+            is_person: object.is_person(),
+            position_std_m: object.position_std_m,
+            speed_std_mps: object.speed_std_mps,
+        }
+    }
+
+    /// What the rules of collective perception watch of an object.
+    #[must_use]
+    pub fn motion_of(&self, object: &Perception) -> PerceivedMotion {
+        PerceivedMotion {
+            object: object.object.into(),
+            kind: match object.is_person {
+                true => ObjectKind::Person,
+                false => ObjectKind::Vehicle,
+            },
+            motion: object.motion(self.own, self.size),
+        }
     }
 
     /// A collective perception message with the objects at `included`; `None` where the projection does not reach.
@@ -518,9 +556,9 @@ impl MessageComposer<'_> {
                 object: object.object,
                 delta_ms,
                 position_cm: position.map(|value| (value * 100.0).round().clamp(-131_072.0, 131_071.0) as i32),
-                position_confidence_cm: (INTERVAL_95 * spec.position_std_m * 100.0).ceil().clamp(1.0, 4095.0) as u16,
+                position_confidence_cm: (INTERVAL_95 * object.position_std_m * 100.0).ceil().clamp(1.0, 4095.0) as u16,
                 velocity_cmps: velocity.map(|value| (value * 100.0).round().clamp(-16_383.0, 16_382.0) as i16),
-                velocity_confidence: confidence(spec.speed_std_mps, 0.01),
+                velocity_confidence: confidence(object.speed_std_mps, 0.01),
                 angle: ((own.heading_rad + object.turn_rad).to_degrees() * 10.0)
                     .round()
                     .rem_euclid(3600.0) as u16,

@@ -416,6 +416,54 @@ fn a_warning_reaches_behind_a_house_by_a_roadside_unit_once() {
 }
 
 #[test]
+fn an_edge_service_tells_behind_a_house_what_it_hears_fused_under_numbers_that_stay() {
+    let mut config = config();
+    config.v2x.pcap = true;
+    config.v2x.perception_range_m = 40.0;
+    config.v2x.perception_position_std_m = 0.2;
+    // Two cars on this side of the house, one on the other. The unit hears all of them and perceives nothing.
+    let cars = [car(0, 0.0, 0.0, 10.0), car(1, 20.0, 3.0, 10.0), car(2, 150.0, 0.0, 0.0)];
+    let unit = |id: &str, services: &[RoadsideService]| RoadsideUnitConfig {
+        range_m: None,
+        ..roadside(id, 100.0, 60.0, services)
+    };
+    let listed = |config: &Config| {
+        let blocks = run(config, vec![house_between()], &cars, 14).0;
+        blocks[13].of(2)
+    };
+    config.v2x.roadside = vec![unit("edge", &[RoadsideService::Cam])];
+    assert!(listed(&config).is_empty());
+    // A second unit hears the first: what was fused is not fused again.
+    config.v2x.roadside = vec![
+        unit("edge", &[RoadsideService::Map]),
+        unit("other", &[RoadsideService::Map]),
+    ];
+    let known = listed(&config);
+    assert_eq!(known.len(), 2, "{known:?}");
+    for (numbers, ids) in &known {
+        assert_eq!((ids[0], ids[2]), (0, 2), "a perceived object: {ids:?}");
+        // Their centres after 1.3 s are 1.25 m before rear axles that have driven 13 m.
+        let age_s = numbers[7];
+        let now_m = [numbers[0] + age_s * numbers[2], numbers[1] + age_s * numbers[3]];
+        let away_m =
+            [[14.25, 0.0], [34.25, 3.0]].map(|place: [f32; 2]| libm::hypotf(now_m[0] - place[0], now_m[1] - place[1]));
+        assert!(away_m.iter().any(|away_m| *away_m < 0.5), "{numbers:?}");
+        // One fix of 0.71 m and a view of 0.2 m over another fix of 0.71 m, and the way since.
+        assert!((0.4..0.71).contains(&numbers[8]), "{numbers:?}");
+    }
+    // The same numbers in every message.
+    let exchange = run(&config, vec![house_between()], &cars, 14).1;
+    let numbers: Vec<Vec<u16>> = exchange
+        .on_air()
+        .iter()
+        .filter_map(|sent| Cpm::decode(geonetworking::decode(&sent.packet).ok()?.1).ok())
+        .filter(|cpm| cpm.origin == CpmOrigin::Roadside)
+        .map(|cpm| cpm.objects.iter().map(|object| object.object).collect())
+        .collect();
+    assert!(numbers.iter().flatten().all(|number| *number < 4), "{numbers:?}");
+}
+
+#[test]
 fn a_separate_listing_has_every_view_and_ones_own() {
     let mut config = config();
     config.v2x.listing = V2xListing::Separate;

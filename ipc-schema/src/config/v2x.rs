@@ -71,11 +71,13 @@ pub enum RoadsideService {
     Cpm,
     /// Warnings that it heard, sent once more.
     Denm,
+    /// The map of an edge service: CPMs of everything that it hears and perceives, fused.
+    Map,
 }
 
 impl RoadsideService {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Cam, Self::Cpm, Self::Denm];
+    pub const ALL: [Self; 4] = [Self::Cam, Self::Cpm, Self::Denm, Self::Map];
 
     /// Name in configurations.
     #[must_use]
@@ -84,6 +86,7 @@ impl RoadsideService {
             Self::Cam => "cam",
             Self::Cpm => "cpm",
             Self::Denm => "denm",
+            Self::Map => "map",
         }
     }
 }
@@ -149,7 +152,7 @@ impl RoadsideUnitConfig {
             None => match service {
                 RoadsideService::Cam => true,
                 RoadsideService::Cpm => self.range_m() > 0.0,
-                RoadsideService::Denm => false,
+                RoadsideService::Denm | RoadsideService::Map => false,
             },
         }
     }

@@ -139,7 +139,7 @@ pub const ROADSIDE_UNIT_KEYS: &[ConfigKey] = &[
     optional("v2x.roadside.range_m", "m", 1.0, 500.0, "Range in which it perceives road users. Unset = it perceives nothing."),
     optional("v2x.roadside.heading_deg", "deg", -360.0, 360.0, "Middle of its field of view, counter-clockwise from east. Unset = 0."),
     optional("v2x.roadside.field_of_view_deg", "deg", 1.0, 360.0, "Angle of its field of view. Unset = all around."),
-    ConfigKey { optional: true, ..other("v2x.roadside.services", ValueKind::TextsOf(TextForm::RoadsideService), "What it sends: CAMs, CPMs of what it perceives, and warnings that it heard once more (\"denm\"). Unset = CAMs, and CPMs with `range_m`.") },
+    ConfigKey { optional: true, ..other("v2x.roadside.services", ValueKind::TextsOf(TextForm::RoadsideService), "What it sends: CAMs, CPMs of what it perceives, warnings that it heard once more (\"denm\"), and CPMs of everything that it hears and perceives, fused (\"map\", in place of \"cpm\"). Unset = CAMs, and CPMs with `range_m`.") },
 ];
 
 /// Keys of a stage of the curriculum.

@@ -27,7 +27,7 @@ fn vehicles_hear_each_other_and_threads_change_nothing() {
     let workplace = Workplace::new();
     let silent = simulate(&workplace, "silent", &[]);
     assert!(silent["v2x"].is_null(), "{}", silent["v2x"]);
-    let unit = "v2x.roadside=[{ id = \"middle\", x_m = 130.0, y_m = 126.0, height_m = 6.0, range_m = 80.0 }]";
+    let unit = "v2x.roadside=[{ id = \"middle\", x_m = 130.0, y_m = 126.0, height_m = 6.0, range_m = 80.0, services = [\"cam\", \"map\"] }]";
     let with = |name: &str, threads: &str| {
         let settings = [
             "v2x.share=1.0",

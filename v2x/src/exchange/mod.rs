@@ -38,7 +38,7 @@ use crate::{
     roadside::RoadsideUnit,
     services::{
         bsm::BsmService, cam::CamService, congestion::CongestionControl, cpm::CpmService, denm::DenmService,
-        relay::WarningRelay, vam::VamService,
+        edge::FusedMap, relay::WarningRelay, vam::VamService,
     },
     station::{
         OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize, object_of_bsm, object_of_cam,
@@ -378,6 +378,7 @@ impl MessageExchange {
             perceived: Vec::new(),
             sighted: None,
             chosen: Vec::new(),
+            edge: FusedMap::default(),
             relay: WarningRelay::default(),
             congestion: CongestionControl::new(self.config.congestion_control),
             map: LocalMap::default(),
@@ -452,6 +453,7 @@ impl MessageExchange {
             deviations: &self.deviations,
             perception: &self.perception,
             roadside,
+            objects: &self.objects,
             config: &self.config,
         };
         let outgoing = outgoing(&tick, &radios, &mut self.stations, self.config.threads as usize);

@@ -8,6 +8,7 @@ use sim_core::geodesy::Projection;
 
 use super::{SlotMeasurement, perception::Observer, size_of};
 use crate::{
+    local_map::{HeardObjects, KnownObject},
     message::{
         GeodeticPoint, StationKind,
         geonetworking::{self, BtpPort, PacketHead},
@@ -22,16 +23,16 @@ use crate::{
     },
     random::RadioRandom,
     roadside::RoadsideUnit,
-    services::{
-        MeasuredMotion,
-        congestion::CongestionControl,
-        cpm::{ObjectKind, PerceivedMotion},
+    services::{MeasuredMotion, congestion::CongestionControl, cpm::PerceivedMotion},
+    station::{
+        MessageComposer, OwnMeasurement, Perception, PerceptionSpec, SensorDeviations, Station, VehicleSize, station_id,
     },
-    station::{MessageComposer, OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize},
 };
 
 /// Length from which a vehicle calls itself a lorry, metres.
 const TRUCK_LENGTH_M: f64 = 7.0;
+/// Most objects in a message of an edge service: some 1500 bytes, as many as a frame may have. The others are due at the next tick.
+const MOST_FUSED: usize = 50;
 /// Bit of the number of a message of the services behind the first two.
 const LATER_SERVICE: u32 = 1 << 31;
 
@@ -127,6 +128,8 @@ pub struct StationTick<'a> {
     pub perception: &'a PerceptionSpec,
     /// Roadside units: their places among the stations follow those of the slots.
     pub roadside: &'a [RoadsideUnit],
+    /// Everything that was heard lately.
+    pub objects: &'a HeardObjects,
     /// Which messages are sent.
     pub config: &'a V2xConfig,
 }
@@ -189,9 +192,46 @@ impl StationTurn<'_> {
         if unit.config.offers(RoadsideService::Cam) {
             self.generate_roadside_cam(tick, &composer);
         }
-        if unit.config.offers(RoadsideService::Cpm) {
+        if unit.config.offers(RoadsideService::Map) {
+            self.generate_map(tick, &composer, unit);
+        } else if unit.config.offers(RoadsideService::Cpm) {
             let observer = Observer::of_roadside(unit, self.station.station, tick);
             self.generate_cpm(tick, &composer, &observer, &unit.perception);
+        }
+    }
+
+    /// A message with everything that the unit hears and perceives, fused, by the rules for perceived objects. What other units have fused is
+    /// not fused again.
+    fn generate_map(&mut self, tick: &StationTick, composer: &MessageComposer, unit: &RoadsideUnit) {
+        let fuses = |unit: &&RoadsideUnit| unit.config.offers(RoadsideService::Map);
+        let others: Vec<u32> = tick
+            .roadside
+            .iter()
+            .filter(fuses)
+            .map(|unit| station_id(unit.id_hash))
+            .collect();
+        let heard = self.station.map.all(tick.objects);
+        let mut views: Vec<KnownObject> = heard
+            .filter(|view| !others.contains(&view.heard_from))
+            .copied()
+            .collect();
+        if unit.perception.range_m > 0.0 {
+            let observer = Observer::of_roadside(unit, self.station.station, tick);
+            let perceived = composer.own_view(&observer.perceive(&unit.perception));
+            // The first is the unit itself.
+            views.extend(perceived.into_iter().skip(1));
+        }
+        let now_ms = (tick.now_ns / 1_000_000) as i64;
+        let fused = self.station.edge.update(now_ms, &views);
+        let objects: Vec<Perception> = fused.iter().map(|object| composer.perception_of(object)).collect();
+        let motions: Vec<PerceivedMotion> = objects.iter().map(|object| composer.motion_of(object)).collect();
+        let gap_ns = self.gap_ns(SendingService::Cpm);
+        let Some(content) = self.station.cpm.check_most(tick.now_ns, &motions, gap_ns, MOST_FUSED) else {
+            return;
+        };
+        let has_sensors = content.has_sensor_information && unit.perception.range_m > 0.0;
+        if let Some(cpm) = composer.cpm(&unit.perception, &objects, &content.objects, has_sensors) {
+            self.send(tick, composer, SendingService::Cpm, &cpm.encode(), &cpm.position);
         }
     }
 
@@ -309,19 +349,9 @@ impl StationTurn<'_> {
         let sighted = self.station.sighted.take();
         let perceived = sighted.unwrap_or_else(|| observer.perceive(spec));
         if tick.config.listing == V2xListing::Separate {
-            self.station.perceived = composer.own_view(spec, &perceived);
+            self.station.perceived = composer.own_view(&perceived);
         }
-        let motions: Vec<PerceivedMotion> = perceived
-            .iter()
-            .map(|object| PerceivedMotion {
-                object: object.object.into(),
-                kind: match object.is_person {
-                    true => ObjectKind::Person,
-                    false => ObjectKind::Vehicle,
-                },
-                motion: object.motion(composer.own, composer.size),
-            })
-            .collect();
+        let motions: Vec<PerceivedMotion> = perceived.iter().map(|object| composer.motion_of(object)).collect();
         let gap_ns = self.gap_ns(SendingService::Cpm);
         let cpm = &mut self.station.cpm;
         let content = match tick.config.inclusion {

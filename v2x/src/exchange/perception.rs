@@ -129,6 +129,8 @@ impl<'a> Observer<'a> {
                 turn_rad: other.yaw_rad - yaw_rad,
                 size_m: [other.length_m.into(), other.width_m.into()],
                 is_person: other.kind == Kind::Person as u32,
+                position_std_m: spec.position_std_m,
+                speed_std_mps: spec.speed_std_mps,
             })
         };
         near.iter().filter_map(object).collect()

@@ -64,6 +64,26 @@ impl CpmService {
         self.check_chosen(now_ns, perceived, objects, dcc_ns)
     }
 
+    /// The same for a message that has room for `most` objects: those that were not included for the longest time come first.
+    pub fn check_most(
+        &mut self,
+        now_ns: u64,
+        perceived: &[PerceivedMotion],
+        dcc_ns: u64,
+        most: usize,
+    ) -> Option<CpmContent> {
+        let mut objects = self.due(now_ns, perceived);
+        if objects.len() > most {
+            objects.sort_by_key(|place| {
+                self.last_included(perceived[*place].object)
+                    .map(|(included_ns, _)| included_ns)
+            });
+            objects.truncate(most);
+            objects.sort_unstable();
+        }
+        self.check_chosen(now_ns, perceived, objects, dcc_ns)
+    }
+
     /// The same for a message with the objects at `objects`, whichever they are.
     pub fn check_chosen(
         &mut self,

@@ -5,6 +5,7 @@ pub mod cam;
 pub mod congestion;
 pub mod cpm;
 pub mod denm;
+pub mod edge;
 pub mod relay;
 pub mod vam;
 
