@@ -62,11 +62,11 @@ def observation(
 
 
 def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None = None) -> bytes:
-    first = np.asarray(position_m, "<f4").tobytes()
+    first, columns = np.asarray(position_m, "<f4").tobytes(), np.shape(position_m)[1]
     if estimate_m is None:
-        return header(tick, len(position_m), 2) + first
+        return header(tick, len(position_m), columns) + first
     second = bytes(-len(first) % layout.ALIGNMENT) + np.asarray(estimate_m, "<f4").tobytes()
-    return header(tick, len(position_m), 2, len(estimate_m)) + first + second
+    return header(tick, len(position_m), columns, len(estimate_m)) + first + second
 
 
 def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:

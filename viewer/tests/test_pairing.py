@@ -38,8 +38,8 @@ def test_without_valid_slots_or_a_policy_there_is_no_error() -> None:
     assert np.isnan(mean_m(found.policy))
 
 
-def test_actions_of_a_driving_policy_are_not_positions() -> None:
-    found = distances(observation(0, [1, 1, 1]), prediction(0, TRUTH, TRUTH), driving=True)
+def test_actions_are_not_positions() -> None:
+    found = distances(observation(0, [1, 1, 1]), prediction(0, TRUTH, TRUTH), has_positions=False)
     assert found.policy is None
     assert mean_m(found.ekf) == 0.0
 

@@ -222,6 +222,20 @@ def test_a_drivers_actions_are_not_drawn_as_positions(drawn: Drawn) -> None:
     assert not [row for _, row in found[plots.POLICY_ERROR].rows if "Scalars:scalars" in row]
 
 
+@pytest.mark.parametrize(("task", "columns"), [("lane", 2), ("messages", 5)])
+def test_answers_of_a_task_that_does_not_localise_are_not_drawn_as_positions(
+    drawn: Drawn, task: str, columns: int
+) -> None:
+    _, found = drawn(
+        ("world", frames.world(1, 2)),
+        ("observation", frames.observation(2, TRUTH, TRUTH)),
+        ("prediction", frames.prediction(2, np.ones((2, columns)))),
+        run_map=MAP | {"task": task},
+    )
+    assert top.PREDICTIONS not in found
+    assert not [row for _, row in found[plots.POLICY_ERROR].rows if "Scalars:scalars" in row]
+
+
 def test_the_followed_vehicle_is_the_origin_of_the_3d_view(drawn: Drawn) -> None:
     _, found = drawn(
         ("vehicles", frames.vehicles(0, {101: "cav 1", 100: "cav 0"})),

@@ -57,11 +57,16 @@ def test_an_empty_slot_is_not_valid() -> None:
 def test_estimates_follow_predictions_where_the_header_says_so() -> None:
     position_m = np.arange(10, dtype=np.float32).reshape(5, 2)
     alone = wire.decode_prediction(frames.prediction(0, position_m))
-    np.testing.assert_array_equal(alone.position_m, position_m)
+    np.testing.assert_array_equal(alone.answer, position_m)
     assert alone.estimate_m is None
     both = wire.decode_prediction(frames.prediction(0, position_m, position_m + 50))
-    np.testing.assert_array_equal(both.position_m, position_m)
+    np.testing.assert_array_equal(both.answer, position_m)
     np.testing.assert_array_equal(both.estimate_m, position_m + 50)
+
+
+def test_an_answer_has_the_numbers_of_its_task() -> None:
+    choices = np.arange(15, dtype=np.float32).reshape(5, 3)
+    np.testing.assert_array_equal(wire.decode_prediction(frames.prediction(0, choices)).answer, choices)
 
 
 def test_rows_come_back() -> None:

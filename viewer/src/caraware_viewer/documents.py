@@ -77,6 +77,8 @@ class RunMap(TypedDict, total=False):
     run: str
     run_id: str
     mode: str
+    task: str
+    """`task.kind`: only the answers of "localisation" are positions."""
     map: MapBounds
     tick_s: float
     real_time_factor: float

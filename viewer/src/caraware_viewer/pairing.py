@@ -59,10 +59,10 @@ class Distances:
     ekf: NDArray[np.float32] | None = None
 
 
-def distances(observation: Observation, prediction: Prediction | None, *, driving: bool = False) -> Distances:
-    """Errors of an observation's fixes and of its prediction; a driving policy's actions are not positions."""
+def distances(observation: Observation, prediction: Prediction | None, *, has_positions: bool = True) -> Distances:
+    """Errors of an observation's fixes and of its prediction, whose answers are positions or actions."""
     raw_gnss = distance_m(observation, observation.gnss_m[:, :2])
-    policy = None if prediction is None or driving else distance_m(observation, prediction.position_m)
+    policy = distance_m(observation, prediction.answer) if prediction is not None and has_positions else None
     estimate_m = None if prediction is None else prediction.estimate_m
     return Distances(raw_gnss, policy, None if estimate_m is None else distance_m(observation, estimate_m))
 

@@ -252,16 +252,14 @@ class Scene:
             return
         observation, prediction = pair
         self._set_tick(observation.header)
-        driving = self._picture.driving
-        if not driving:
-            top.draw_estimates(
-                self._canvas, top.PREDICTIONS, observation, prediction.position_m, self._shown(observation)
-            )
+        has_positions = self._map.get("task", "localisation") == "localisation" and not self._picture.driving
+        if has_positions:
+            top.draw_estimates(self._canvas, top.PREDICTIONS, observation, prediction.answer, self._shown(observation))
         if prediction.estimate_m is not None:
             top.draw_estimates(
                 self._canvas, top.ESTIMATES, observation, prediction.estimate_m, self._shown(observation)
             )
-        self._picture.distances = distances(observation, prediction, driving=driving)
+        self._picture.distances = distances(observation, prediction, has_positions=has_positions)
         plots.plot_errors(self._canvas, self._picture.distances)
 
     def _draw_signals(self, frame: wire.Table) -> None:

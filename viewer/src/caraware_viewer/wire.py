@@ -122,11 +122,11 @@ _OBSERVED = tuple(Observation.__dataclass_fields__.keys() - {"header"})
 
 @dataclass(frozen=True)
 class Prediction:
-    """The policy's predictions from the observation of the same tick."""
+    """The policy's answers to the observation of the same tick."""
 
     header: Header
-    position_m: NDArray[np.float32]
-    """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
+    answer: NDArray[np.float32]
+    """`[n, a]`, one row for each slot of the observation: x, y (metres, world frame) where the task is to localise."""
     estimate_m: NDArray[np.float32] | None
     """`[n, 2]`: estimates of the Kalman filter, metres; NaN where it has none. `None` if the filter does not run."""
 
@@ -188,9 +188,7 @@ def decode_observation(frame: bytes) -> Observation:
 def decode_prediction(frame: bytes) -> Prediction:
     """A `prediction` frame."""
     header = decode_header(frame)
-    _, columns, estimated_slots, *_ = header.shape
-    if columns != 2:
-        raise FrameError(f"a prediction has the columns x and y, but this one has {columns}")
+    _, _, estimated_slots, *_ = header.shape
     sections = _sections(frame, "prediction", header)
     return Prediction(header, sections["prediction"], sections["estimate_m"] if estimated_slots else None)
 
