@@ -15,6 +15,7 @@ from caraware.envs.transition import Rows
 from caraware.ipc.arrays import BoolArray
 from caraware.ipc.run_file import ConfigError, RunFile
 from caraware.learn.encoders import CandidateNetwork
+from caraware.run.trips import has_trips
 from caraware.tasks.contract import (
     EndKind,
     OutcomeMissingError,
@@ -245,3 +246,7 @@ def test_each_candidate_is_judged_alike_wherever_it_stands() -> None:
     assert torch.allclose(value(turned), value(rows), atol=1e-6) and value(rows).shape == (5, 1)
     with pytest.raises(ValueError, match="messages"):
         CandidateNetwork(width + 1, 3, (8,))
+
+
+def test_trips_are_those_of_drivers() -> None:
+    assert [name for name in TASKS if has_trips(task_of_run(run_of(name)))] == ["driving"]

@@ -8,15 +8,15 @@ import numpy as np
 
 from caraware.ipc.stream import Observation
 from caraware.tasks.contract import Task
-from caraware.tasks.ends import ARRIVAL, END_NAMES, name_of
+from caraware.tasks.ends import END_NAMES, OFF_ROAD, name_of
 
 Trips = Counter[str]
 """Trips by the name of their end."""
 
 
 def has_trips(task: Task) -> bool:
-    """Whether trajectories of a task are trips, which can arrive."""
-    return any(end.name == END_NAMES[ARRIVAL] for end in task.ends)
+    """Whether trajectories of a task are trips of a driver, which can fail beside the road."""
+    return any(end.name == END_NAMES[OFF_ROAD] for end in task.ends)
 
 
 @dataclass
