@@ -2,7 +2,11 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
 
+mod common;
+
 use std::sync::Arc;
+
+use common::projection;
 
 use ipc_schema::{
     config::{Config, TaskKind, V2xInclusion},
@@ -11,13 +15,9 @@ use ipc_schema::{
         ACHIEVED_COLUMNS, CANDIDATE_COLUMNS, NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections,
         RADIO_COLUMNS, SPEAKER_COLUMNS, speech_width,
     },
-    run::MapInfo,
     world::VehicleState,
 };
-use sim_core::{
-    geodesy::Projection,
-    scene::{Prism, Road, Scene, SolidClass},
-};
+use sim_core::scene::{Prism, Road, Scene, SolidClass};
 use v2x::{
     exchange::{MessageExchange, SlotMeasurement, speech::SpeechCounts},
     station::OwnMeasurement,
@@ -30,10 +30,8 @@ const KNOWN: usize = 2;
 const IN_RANGE: usize = 3;
 
 fn config(inclusion: V2xInclusion) -> Config {
-    let mut config: Config = serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = common::config();
     config.task.kind = TaskKind::Messages;
-    config.v2x.share = 1.0;
-    config.v2x.fading = false;
     config.v2x.inclusion = inclusion;
     config.v2x.candidates = CANDIDATES as u32;
     config.v2x.perception_range_m = 60.0;
@@ -42,29 +40,9 @@ fn config(inclusion: V2xInclusion) -> Config {
     config
 }
 
-fn projection() -> Projection {
-    let map = MapInfo {
-        projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
-        net_offset_m: [129.0, 126.0],
-        world_origin_m: [0.0; 2],
-        bounds_m: [0.0, 0.0, 260.0, 260.0],
-        traffic_lights: 0,
-    };
-    Projection::new(&map).unwrap()
-}
-
+/// A car that stands.
 fn car(number: u32, x_m: f64, y_m: f64) -> VehicleState {
-    VehicleState {
-        x_m,
-        y_m,
-        id_hash: 1000 + u64::from(number),
-        length_m: 4.5,
-        width_m: 1.8,
-        height_m: 1.5,
-        rear_overhang_m: 1.0,
-        vehicle: number,
-        ..VehicleState::default()
-    }
+    common::car(number, x_m, y_m, 0.0)
 }
 
 struct Tick {

@@ -4,6 +4,7 @@ use ipc_schema::{
     config::{KEYS_OF_A_KIND, LidarPattern},
     field::{FIELD_PRESETS, FIELDS},
     metric::PolicyMetric,
+    neighbours::MOST_CANDIDATES,
 };
 
 use super::text_form::TextForm;
@@ -442,7 +443,7 @@ pub const KEYS: &[ConfigKey] = &[
     other("v2x.congestion_control", ValueKind::Choice(&["off", "reactive", "adaptive"]), "Decentralised congestion control: none, by a table of states, or by a control loop (ETSI TS 102 687)."),
     float("v2x.perception_range_m", "m", 0.0, 500.0, "Range in which a vehicle perceives objects for its collective perception messages; 0 = no such messages."),
     other("v2x.inclusion", ValueKind::Choice(&["standard", "all", "needed", "policy"]), "Which of the objects that a vehicle perceives its CPMs list: those that the rules of ETSI TS 103 324 name; all, at every tick; those that a station nearby lacks, as if all maps were known; or those that the trainer chooses (`task.kind` = \"messages\")."),
-    integer("v2x.candidates", "objects", 1, 32, "Messages task: the nearest perceived objects that the policy chooses from (docs/messages.md)."),
+    integer("v2x.candidates", "objects", 1, MOST_CANDIDATES as i64, "Messages task: the nearest perceived objects that the policy chooses from (docs/messages.md)."),
     float("v2x.awareness_range_m", "m", 1.0, 1000.0, "Messages task: range in which a station is to know all road users."),
     float("v2x.perception_position_std_m", "m", 0.0, 10.0, "Standard deviation of the position of a perceived object on each axis."),
     float("v2x.perception_speed_std_mps", "m/s", 0.0, 10.0, "Standard deviation of the velocity of a perceived object on each axis."),

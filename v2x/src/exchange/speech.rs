@@ -31,6 +31,9 @@ pub const NEWS_MS: i64 = 300;
 const FAR_M: f64 = 100.0;
 const FAST_MPS: f64 = 25.0;
 const OLD_S: f64 = 2.0;
+const MOVED_M: f64 = 8.0;
+const FASTER_MPS: f64 = 1.0;
+const TURNED_RAD: f64 = 8.0 * std::f64::consts::PI / 180.0;
 const MANY_PERCEIVED: f64 = 32.0;
 const MANY_KNOWN: f64 = 128.0;
 const MANY_STATIONS: f64 = 64.0;
@@ -71,6 +74,16 @@ struct InRange {
     until_ms: i64,
     /// What messages of the tick before extend that time to, by the slot of their senders, ms.
     extended: Vec<(usize, i64)>,
+}
+
+/// The views that a station's map has of an object.
+#[derive(Debug, Clone, Copy, Default)]
+struct ObjectViews {
+    /// Time of the newest, ms, and where it lets one expect the object now.
+    newest: Option<(i64, Point)>,
+    count: usize,
+    /// The object speaks for itself.
+    speaks: bool,
 }
 
 /// What happens at a tick, for all stations.
@@ -368,6 +381,7 @@ impl SpeechTick<'_> {
         ]
     }
 
+    /// The numbers of each candidate.
     fn candidates(
         &self,
         station: &Station,
@@ -375,57 +389,13 @@ impl SpeechTick<'_> {
         size: &VehicleSize,
         sighted: &[Perception],
     ) -> Vec<[f32; CANDIDATE_COLUMNS]> {
-        #[derive(Default)]
-        struct Views {
-            /// Time and place now of the newest.
-            newest: Option<(i64, Point)>,
-            count: usize,
-            speaks: bool,
-        }
         let motions: Vec<MeasuredMotion> = sighted.iter().map(|object| object.motion(own, size)).collect();
-        let mut views: Vec<Views> = motions.iter().map(|_| Views::default()).collect();
-        for view in station.map.all(self.objects) {
-            let there_m = view.position_at_m(self.now_ms);
-            let away2 = |motion: &MeasuredMotion| distance2(motion.position_m, there_m);
-            let nearest = motions
-                .iter()
-                .zip(&mut views)
-                .min_by(|(a, _), (b, _)| away2(a).total_cmp(&away2(b)));
-            let Some((_, of_object)) =
-                nearest.filter(|(motion, _)| away2(motion) <= SAME_ROAD_USER_M * SAME_ROAD_USER_M)
-            else {
-                continue;
-            };
-            of_object.count += 1;
-            of_object.speaks |= view.source != NeighbourSource::Cpm;
-            if of_object
-                .newest
-                .is_none_or(|(measured_ms, _)| measured_ms < view.measured_ms)
-            {
-                of_object.newest = Some((view.measured_ms, there_m));
-            }
-        }
+        let views = self.views_of(station, &motions);
         let described = sighted.iter().zip(&motions).zip(&views);
         described
             .map(|((object, motion), views)| {
                 let [ahead, left] = object.position_body_m;
-                let told = station.cpm.last_included(object.object.into());
-                let [since, moved, faster, turned, astray] = match told {
-                    None => [1.0; 5],
-                    Some((told_ns, before)) => {
-                        let since_s = (self.now_ns - told_ns) as f64 / NS_PER_S;
-                        let (sin, cos) = libm::sincos(before.heading_rad);
-                        let way_m = since_s * before.speed_mps;
-                        let expected_m = [before.position_m[0] + way_m * cos, before.position_m[1] + way_m * sin];
-                        [
-                            share(since_s, OLD_S),
-                            share(distance2(motion.position_m, before.position_m).sqrt(), 8.0),
-                            share((motion.speed_mps - before.speed_mps).abs(), 1.0),
-                            share(turn(before.heading_rad, motion.heading_rad).abs(), 8.0_f64.to_radians()),
-                            share(distance2(motion.position_m, expected_m).sqrt(), 8.0),
-                        ]
-                    }
-                };
+                let [since, moved, faster, turned, astray] = self.since_told(station, object, motion);
                 let [age, error] = match views.newest {
                     None => [1.0; 2],
                     Some((measured_ms, there_m)) => [
@@ -452,6 +422,52 @@ impl SpeechTick<'_> {
                 ]
             })
             .collect()
+    }
+
+    /// What the station's map has of each of the objects that it perceives: a view is of the nearest.
+    fn views_of(&self, station: &Station, motions: &[MeasuredMotion]) -> Vec<ObjectViews> {
+        let mut views = vec![ObjectViews::default(); motions.len()];
+        for view in station.map.all(self.objects) {
+            let there_m = view.position_at_m(self.now_ms);
+            let away2 = |motion: &MeasuredMotion| distance2(motion.position_m, there_m);
+            let nearest = motions
+                .iter()
+                .zip(&mut views)
+                .min_by(|(a, _), (b, _)| away2(a).total_cmp(&away2(b)));
+            let Some((_, of_object)) =
+                nearest.filter(|(motion, _)| away2(motion) <= SAME_ROAD_USER_M * SAME_ROAD_USER_M)
+            else {
+                continue;
+            };
+            of_object.count += 1;
+            of_object.speaks |= view.source != NeighbourSource::Cpm;
+            if of_object
+                .newest
+                .is_none_or(|(measured_ms, _)| measured_ms < view.measured_ms)
+            {
+                of_object.newest = Some((view.measured_ms, there_m));
+            }
+        }
+        views
+    }
+
+    /// What has changed since the station listed the object for the last time: time, place, speed, heading, and the distance from where
+    /// that message lets receivers expect it.
+    fn since_told(&self, station: &Station, object: &Perception, motion: &MeasuredMotion) -> [f32; 5] {
+        let Some((told_ns, before)) = station.cpm.last_included(object.object.into()) else {
+            return [1.0; 5];
+        };
+        let since_s = (self.now_ns - told_ns) as f64 / NS_PER_S;
+        let (sin, cos) = libm::sincos(before.heading_rad);
+        let way_m = since_s * before.speed_mps;
+        let expected_m = [before.position_m[0] + way_m * cos, before.position_m[1] + way_m * sin];
+        [
+            share(since_s, OLD_S),
+            share(distance2(motion.position_m, before.position_m).sqrt(), MOVED_M),
+            share((motion.speed_mps - before.speed_mps).abs(), FASTER_MPS),
+            share(turn(before.heading_rad, motion.heading_rad).abs(), TURNED_RAD),
+            share(distance2(motion.position_m, expected_m).sqrt(), MOVED_M),
+        ]
     }
 }
 
