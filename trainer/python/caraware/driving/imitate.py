@@ -21,6 +21,7 @@ from caraware.driving.lessons import Lessons, Limits
 from caraware.ipc.arrays import BoolArray, UInt32Array
 from caraware.ipc.channel import Channel, Observation
 from caraware.ipc.run_file import ConfigError, setting
+from caraware.learn.adam import ModuleAdam
 from caraware.learn.build import build_ppo, configure_torch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.ppo import PlainUpdate
@@ -96,16 +97,15 @@ def clone(data: dict[str, Tensor], updater: PlainUpdate, generator: torch.Genera
     count = len(data["action"])
     taught = max(1, int(count * (1 - HELD_OUT)))
     policy = updater.policy
-    optimiser = torch.optim.Adam(policy.network.parameters(), 1e-3)
+    optimiser = ModuleAdam(policy.network.parameters())
     for epoch in range(EPOCHS):
-        for group in optimiser.param_groups:
-            group["lr"] = 1e-3 * (1 - epoch / EPOCHS)
+        learning_rate = 1e-3 * (1 - epoch / EPOCHS)
         for rows in torch.randperm(taught, generator=generator).split(BATCH):
             observation, action = lessons.displaced(data["observation"][rows], data["action"][rows], generator)
             loss = (policy(observation) - action).square().mean()
             optimiser.zero_grad()
             loss.backward()
-            optimiser.step()
+            optimiser.step(learning_rate)
     with torch.no_grad():
         held = data["action"][taught:]
         error = (policy(data["observation"][taught:]) - held).abs().mean(0)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor, nn
 
-from caraware.learn.adam import EPSILON
+from caraware.learn.adam import EPSILON, ModuleAdam
 from caraware.learn.batch import Batch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.drawing import DrawingPredictor
@@ -158,7 +158,7 @@ class PolicyUpdate(Protocol):
 
 
 class PlainUpdate:
-    """The reference: autograd and `torch.optim.Adam`, for any two networks that are `nn.Module`s."""
+    """The reference: autograd and Adam, for any two networks that are `nn.Module`s."""
 
     def __init__(self, config: TrainerConfig, policy: GaussianPolicy, value: nn.Module, device: torch.device) -> None:
         """`policy` maps observations `[b, d]` to mean actions `[b, a]`, `value` to `[b, 1]`."""
@@ -166,10 +166,7 @@ class PlainUpdate:
         self._config = config
         self._policy, self._value = policy.to(device), value.to(device)
         self._acting, self._acting_version = self._policy, -1
-        self._adam = {
-            name: torch.optim.Adam(network.parameters(), eps=EPSILON)
-            for name, network in (("policy", self._policy), ("value", self._value))
-        }
+        self._adam = {name: ModuleAdam(self._ordered(name), EPSILON) for name in ("policy", "value")}
 
     @property
     def policy(self) -> GaussianPolicy:
@@ -265,9 +262,7 @@ class PlainUpdate:
         adam, network = self._adam[name], self._policy if name == "policy" else self._value
         norm = nn.utils.clip_grad_norm_(network.parameters(), self._config.max_grad_norm)
         finite(f"the {name} gradient", norm, now)
-        for group in adam.param_groups:
-            group["lr"] = now.learning_rate
-        adam.step()
+        adam.step(now.learning_rate)
         return norm.item()
 
     @property
@@ -314,27 +309,17 @@ class PlainUpdate:
         """See `PolicyUpdate.moments`: of each network the running moments in one vector, and the count of steps."""
         moments: dict[str, Tensor] = {}
         for name, adam in self._adam.items():
-            states = [adam.state[parameter] for parameter in self._ordered(name)]
-            for own, torchs in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
-                columns = zip(states, self._ordered(name), strict=True)
-                zero_before = [state.get(torchs, torch.zeros_like(parameter)) for state, parameter in columns]
-                moments[f"{name}.{own}"] = torch.cat([column.detach().flatten() for column in zero_before])
-            moments[f"{name}.steps"] = torch.tensor(int(states[0].get("step", 0)))
+            moments[f"{name}.mean"] = torch.cat([mean.flatten() for mean in adam.means])
+            moments[f"{name}.square"] = torch.cat([square.flatten() for square in adam.squares])
+            moments[f"{name}.steps"] = torch.tensor(int(adam.steps[0]))
         return moments
 
     def restore_moments(self, moments: dict[str, Tensor]) -> None:
         """See `PolicyUpdate.restore_moments`."""
         for name, adam in self._adam.items():
-            ordered = self._ordered(name)
-            sizes = [parameter.numel() for parameter in ordered]
-            steps = moments[f"{name}.steps"].to(torch.float32)
-            columns = (moments[f"{name}.{own}"].to(self.device).split(sizes) for own in ("mean", "square"))
-            for parameter, mean, square in zip(ordered, *columns, strict=True):
-                adam.state[parameter] = {
-                    "step": steps.clone(),
-                    "exp_avg": mean.view_as(parameter).clone(),
-                    "exp_avg_sq": square.view_as(parameter).clone(),
-                }
+            sizes = [mean.numel() for mean in adam.means]
+            means, squares = (moments[f"{name}.{own}"].split(sizes) for own in ("mean", "square"))
+            adam.restore(means, squares, moments[f"{name}.steps"].item())
 
     def _ordered(self, name: str) -> list[nn.Parameter]:
         """The parameters in the order of a checkpoint: the logarithm of the standard deviation is the last."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from caraware.ipc.stream import Observation
+from caraware.learn.adam import ModuleAdam
 from caraware.learn.batch import Batch
 from caraware.learn.cnn import mean_network
 from caraware.learn.config import BuiltInNetwork, TrainerConfig
@@ -63,7 +64,7 @@ class Regression:
             mlp = policy_mlp(observation_size, actions, config.hidden, Activation(config.activation))
             mlp.initialise(torch.Generator().manual_seed(self._seed))
             self._network = mlp.to(device)
-        self._adam = torch.optim.Adam(self._network.parameters())
+        self._adam = ModuleAdam(self._network.parameters())
 
     def learn(self, batch: Batch, learning_rate: float) -> float:
         """PPO's epochs over a batch, in minibatches of PPO's size; the mean distance.
@@ -73,8 +74,6 @@ class Regression:
         generator = torch.Generator().manual_seed(self._seed + 1 + int(self._steps))
         samples = len(batch.reward)
         parts = max(1, round(samples / self._config.batch_size))
-        for group in self._adam.param_groups:
-            group["lr"] = learning_rate
         targets = self._task.targets(batch.truth)
         distances = torch.zeros((), device=self._device)
         for _ in range(self._config.epochs):
@@ -84,7 +83,7 @@ class Regression:
                 self._adam.zero_grad()
                 distance.backward()
                 nn.utils.clip_grad_norm_(self._network.parameters(), self._config.max_grad_norm)
-                self._adam.step()
+                self._adam.step(learning_rate)
                 self._steps += 1
                 distances += distance.detach()
         return (distances / (parts * self._config.epochs)).item()
@@ -115,10 +114,8 @@ class Regression:
     def tensors(self) -> dict[str, Tensor]:
         """Parameters and moments by name, for a checkpoint."""
         tensors = {f"network.{name}": tensor for name, tensor in self._network.state_dict().items()}
-        for number, parameter in enumerate(self._network.parameters()):
-            state = self._adam.state[parameter]
-            for moment in ("exp_avg", "exp_avg_sq"):
-                tensors[f"{moment}.{number}"] = state.get(moment, torch.zeros_like(parameter))
+        for moment, columns in (("exp_avg", self._adam.means), ("exp_avg_sq", self._adam.squares)):
+            tensors |= {f"{moment}.{number}": column for number, column in enumerate(columns)}
         return tensors | {"steps": self._steps}
 
     def restore(self, stored: dict[str, Tensor]) -> None:
@@ -127,8 +124,8 @@ class Regression:
             {name.removeprefix("network."): tensor for name, tensor in stored.items() if name.startswith("network.")}
         )
         self._steps = stored["steps"].clone()
-        for number, parameter in enumerate(self._network.parameters()):
-            moments = {
-                moment: stored[f"{moment}.{number}"].to(self._device).clone() for moment in ("exp_avg", "exp_avg_sq")
-            }
-            self._adam.state[parameter] = {"step": self._steps.to(torch.float32), **moments}
+        means, squares = (
+            [stored[f"{moment}.{number}"] for number in range(len(self._adam.means))]
+            for moment in ("exp_avg", "exp_avg_sq")
+        )
+        self._adam.restore(means, squares, self._steps.item())
