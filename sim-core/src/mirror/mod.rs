@@ -94,7 +94,7 @@ const NOWHERE: u32 = u32::MAX;
 /// Most road users announced in one episode: four bytes are kept for each.
 const MAX_ANNOUNCED: u32 = 1 << 26;
 
-/// Rows between a path that is prefetched and the one at hand.
+/// Rows between the road user at hand and one whose path is prefetched; one that is prefetched itself is twice as far away.
 const PATHS_AHEAD: usize = 4;
 
 /// All road users of the current episode.
@@ -306,9 +306,10 @@ impl Mirror {
         }
     }
 
-    /// Prefetches road users and their paths some rows behind `index`: a path is spread over memory, and each road user would wait for it.
+    /// Prefetches road users, and their paths if there is a preview, some rows behind `index`: each road user would wait for its own, and
+    /// a path is spread over memory.
     #[inline(never)]
-    fn prefetch_paths(&self, states: &[TrafficState], index: usize) {
+    fn prefetch(&self, states: &[TrafficState], index: usize) {
         let place = |rows: usize| {
             let later = states.get(index + rows)?;
             self.places.get(later.vehicle as usize).map(|place| *place as usize)
@@ -333,9 +334,7 @@ impl Mirror {
         self.in_whole_step = 0;
         let tick = header.tick;
         for (index, now) in states.iter().enumerate() {
-            if !self.paths.is_empty() {
-                self.prefetch_paths(states, index);
-            }
+            self.prefetch(states, index);
             let vehicle = now.vehicle;
             let place = self.place(vehicle).ok_or(MirrorError::Unannounced { vehicle, tick })?;
             if !is_finite(now) {
