@@ -14,7 +14,10 @@ use std::{
     time::Duration,
 };
 
-use fanout::network::keys::{RunKeys, Topic};
+use fanout::network::{
+    endpoint,
+    keys::{RunKeys, Topic},
+};
 use harness::{PATIENCE, Run, ask, publisher, send_world, until};
 use ipc_schema::{
     config::Commander,
@@ -63,7 +66,7 @@ fn connect(run: &Run, more: &str) -> zenoh::Result<zenoh::Session> {
              scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }}, {more} }}"#,
         run.port
     ))?;
-    zenoh::open(config).wait()
+    endpoint::open(config)
 }
 
 /// One attempt to connect as `user`.
@@ -265,7 +268,7 @@ fn certificates_grant_access() {
                  transport: {{ link: {{ tls: {{ {tls} }} }} }} }}"#,
             run.port
         ));
-        zenoh::open(config.unwrap()).wait()
+        endpoint::open(config.unwrap())
     };
     let with = |name: &str| {
         format!(

@@ -102,6 +102,16 @@ pub struct Config {
 }
 
 impl Config {
+    /// The configuration that this text describes, as a run file has it.
+    ///
+    /// Reading it is many thousand lines of code, which this crate compiles once: each crate that calls `serde_json` itself compiles them again.
+    ///
+    /// # Errors
+    /// The text is not JSON, lacks a key, or has a value that is no value of its key.
+    pub fn from_json(text: &str) -> Result<Self, serde_json::Error> {
+        serde_json::from_str(text)
+    }
+
     /// Heroes alive at a time, at most; 0 if the task is not driving.
     #[must_use]
     pub fn heroes(&self) -> usize {

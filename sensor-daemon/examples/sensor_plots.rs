@@ -64,7 +64,7 @@ const CORRELATION_TIME_S: f64 = 20.0;
 const DRIVE: [[f64; 2]; 3] = [[-60.0, 0.0], [150.0, 0.0], [150.0, 160.0]];
 
 fn town() -> Config {
-    serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).expect("the preset as resolved")
+    Config::from_json(include_str!("../../ipc-schema/tests/town.json")).expect("the preset as resolved")
 }
 
 fn map() -> MapInfo {

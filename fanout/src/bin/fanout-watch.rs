@@ -14,7 +14,7 @@ use std::{
 };
 
 use fanout::{
-    network::{keys::RunKeys, publisher::read_attachment},
+    network::{endpoint, keys::RunKeys, publisher::read_attachment},
     reader,
 };
 use ipc_schema::header::MessageHeader;
@@ -141,7 +141,7 @@ fn connect(endpoint: &str) -> Result<zenoh::Session, Failure> {
              scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }},
              transport: {{ shared_memory: {{ enabled: false }} }} }}"#
     ))?;
-    zenoh::open(config).wait()
+    endpoint::open(config)
 }
 
 /// Starts a link of `bytes_per_s` to `endpoint`, and returns its address. Its buffers are short, as those of a real link.

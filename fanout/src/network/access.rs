@@ -213,8 +213,8 @@ mod tests {
     use super::*;
 
     fn fanout(listen: &str, commanders: &[&str]) -> FanoutConfig {
-        let mut config: ipc_schema::config::Config =
-            serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+        let mut config =
+            ipc_schema::config::Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
         config.fanout.listen = listen.parse().unwrap();
         config.fanout.commanders = commanders.iter().map(|name| name.parse().unwrap()).collect();
         config.fanout

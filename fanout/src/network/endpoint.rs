@@ -21,7 +21,15 @@ pub fn listen(settings: &FanoutConfig) -> Result<zenoh::Session, NetworkError> {
     for (key, value) in access::settings(settings) {
         config.insert_json5(key, &value).map_err(failed)?;
     }
-    zenoh::open(config).wait().map_err(failed)
+    open(config).map_err(failed)
+}
+
+/// Opens a zenoh session, of a client as well. Each crate that calls `zenoh::open` compiles most of zenoh's session again.
+///
+/// # Errors
+/// zenoh refuses the configuration, or cannot listen or connect as it says.
+pub fn open(config: Config) -> zenoh::Result<zenoh::Session> {
+    zenoh::open(config).wait()
 }
 
 /// zenoh's configuration: one endpoint, no discovery, no shared memory, no administration space. With these waits, queues and buffer a
@@ -72,8 +80,8 @@ mod tests {
     use super::*;
 
     fn failure(endpoint: &str) -> Failure {
-        let config: ipc_schema::config::Config =
-            serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+        let config =
+            ipc_schema::config::Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
         let settings = FanoutConfig {
             listen: endpoint.parse().unwrap(),
             ..config.fanout

@@ -12,10 +12,14 @@ use std::{
 };
 
 use bytemuck::{cast_slice, cast_slice_mut};
-use fanout::network::keys::{RunKeys, Topic};
+use fanout::network::{
+    endpoint,
+    keys::{RunKeys, Topic},
+};
 use ipc_schema::{
     SCHEMA_VERSION,
     block::view_mut,
+    config::Config,
     header::{DIMENSIONS, MessageHeader},
     membership::RunMembership,
     observation::ObservationLayout,
@@ -175,7 +179,7 @@ impl Run {
                  scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }} }}"#,
             self.port
         ));
-        zenoh::open(config.unwrap()).wait().unwrap()
+        endpoint::open(config.unwrap()).unwrap()
     }
 }
 
@@ -376,7 +380,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
         scene_files: SceneFiles::default(),
         maps: Vec::new(),
         sumo_home: "none".into(),
-        config: serde_json::from_value(config(port)).unwrap(),
+        config: config(port),
         config_hash: String::new(),
         beginning: None,
         restart: None,
@@ -386,12 +390,11 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
 }
 
 /// The default preset with fewer sub-steps, room for more road users, and LIDARs.
-fn config(port: u16) -> serde_json::Value {
-    let mut config: serde_json::Value =
-        serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
-    config["run"]["sub_steps"] = SUB_STEPS.into();
-    config["traffic"]["max_road_users"] = 2100.into();
-    config["lidar"]["vehicles"] = 2.into();
-    config["fanout"]["listen"] = format!("tcp/127.0.0.1:{port}").into();
+fn config(port: u16) -> Config {
+    let mut config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+    config.run.sub_steps = SUB_STEPS;
+    config.traffic.max_road_users = 2100;
+    config.lidar.vehicles = 2;
+    config.fanout.listen = format!("tcp/127.0.0.1:{port}").parse().unwrap();
     config
 }

@@ -436,7 +436,7 @@ mod tests {
     use super::*;
 
     fn config() -> Config {
-        serde_json::from_str(include_str!("../../tests/town.json")).unwrap()
+        Config::from_json(include_str!("../../tests/town.json")).unwrap()
     }
 
     fn camera(name: &str) -> SuiteSensor {

@@ -10,7 +10,7 @@ use ipc_schema::{
 
 /// The default preset.
 pub fn town() -> Config {
-    serde_json::from_str(include_str!("../town.json")).unwrap()
+    Config::from_json(include_str!("../town.json")).unwrap()
 }
 
 /// A run named `name` in `directory`. Its supervisor is the parent of this process.

@@ -18,7 +18,7 @@ use ipc_schema::{
 use sensor_daemon::sensing::{Sensing, WorldTick};
 
 pub fn config() -> Config {
-    serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
+    Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
 }
 
 /// The preset without any noise.

@@ -18,7 +18,7 @@ impl DrivableGround for Strip {
 
 fn config() -> config::Config {
     let text = include_str!("../../../ipc-schema/tests/town.json");
-    let mut config: config::Config = serde_json::from_str(text).unwrap();
+    let mut config = config::Config::from_json(text).unwrap();
     config.task.kind = config::TaskKind::Driving;
     config.task.time_limit_s = 2.0;
     config

@@ -5,5 +5,5 @@ use ipc_schema::config::Config;
 /// The default preset.
 #[allow(clippy::unwrap_used, reason = "a test keeps the committed file readable")]
 pub fn town() -> Config {
-    serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
+    Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
 }

@@ -2,7 +2,7 @@
 
 use std::{
     os::unix::process::ExitStatusExt,
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::{Child, Command, Stdio},
     sync::{
         Arc,
@@ -14,6 +14,7 @@ use std::{
 use ipc_schema::{
     SCHEMA_VERSION, block,
     board::State,
+    config::Config,
     failure::{Failure, FailureKind},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::RunMembership,
@@ -323,7 +324,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
         scene_files: SceneFiles::default(),
         maps: Vec::new(),
         sumo_home: sumo_home(),
-        config: serde_json::from_value(config(ticks, step_s)).unwrap(),
+        config: config(ticks, step_s),
         config_hash: String::new(),
         beginning: None,
         restart: None,
@@ -333,15 +334,14 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
 }
 
 /// The default preset with the values that these tests need.
-fn config(ticks: u64, step_s: f64) -> serde_json::Value {
-    let preset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../ipc-schema/tests/town.json");
-    let mut config: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(preset).unwrap()).unwrap();
-    config["run"]["window_ticks"] = WINDOW_TICKS.into();
-    config["traffic"]["step_s"] = step_s.into();
-    config["traffic"]["cavs"] = CAVS.into();
-    config["traffic"]["others"] = 0.into();
-    config["traffic"]["pedestrians"] = 0.into();
-    config["episode"]["ticks"] = ticks.into();
-    config["episode"]["training_episodes"] = 2.into();
+fn config(ticks: u64, step_s: f64) -> Config {
+    let mut config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+    config.run.window_ticks = u32::try_from(WINDOW_TICKS).unwrap();
+    config.traffic.step_s = step_s;
+    config.traffic.cavs = CAVS;
+    config.traffic.others = 0;
+    config.traffic.pedestrians = 0;
+    config.episode.ticks = ticks;
+    config.episode.training_episodes = 2;
     config
 }
