@@ -343,10 +343,10 @@ impl RoadUser {
         let Mover::Vehicle { state, path } = &mut self.mover else {
             return None;
         };
-        *state = batch.state(member);
+        // At once: a processor waits if it loads as a vector what it has just stored number by number.
+        *state = batch.state(member).settled();
         let start_s = f64::from(tick) * settings.tick_s;
         let end_s = start_s + settings.tick_s;
-        *state = state.settled();
         let road = batch.road(member);
         write_moved(state, road, path.road(start_s).0, rows, out);
         // Only their own sensors read it.
