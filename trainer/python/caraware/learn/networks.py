@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import skip_init
 
 if TYPE_CHECKING:
     from caraware.learn.frames import Seen
@@ -52,8 +51,10 @@ class Mlp(nn.Module):
     def __init__(self, layers: Sequence[Layer]) -> None:
         super().__init__()
         self.layers = tuple(layers)
-        for i, layer in enumerate(layers):
-            self.add_module(f"layer{i}", skip_init(nn.Linear, layer.inputs, layer.outputs))
+        # torch's own draws are replaced and must not move its generator. `skip_init` draws none, but imports sympy.
+        with torch.random.fork_rng(devices=[]):
+            for i, layer in enumerate(layers):
+                self.add_module(f"layer{i}", nn.Linear(layer.inputs, layer.outputs))
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
