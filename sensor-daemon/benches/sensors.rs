@@ -32,7 +32,7 @@ const ROUNDS: usize = 9;
 
 fn main() {
     // The default preset as the `caraware` command resolves it.
-    let preset: Config = Config::from_json(include_str!("../../ipc-schema/tests/town.json"))
+    let preset = Config::from_json(include_str!("../../ipc-schema/tests/town.json"))
         .unwrap_or_else(|error| panic!("town.json: {error}"));
     let fast = Config {
         imu: ipc_schema::config::ImuConfig {

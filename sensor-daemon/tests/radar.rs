@@ -18,7 +18,7 @@ use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
 /// A radar at the origin of its carrier, 0.5 m up, without false alarms to speak of.
 fn config() -> Config {
-    let mut config: Config = Config::from_json(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = Config::from_json(include_str!("../../ipc-schema/tests/town.json")).unwrap();
     config.radar.mount = [0.0, 0.0, 0.5, 0.0, 0.0, 0.0];
     config.radar.false_alarm_probability = 1e-12;
     config

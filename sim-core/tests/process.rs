@@ -49,7 +49,7 @@ impl Run {
         std::fs::write(&poly, format!("<additional>{house}</additional>")).unwrap();
         let net_file = run_dir.join("a.net.xml");
         std::fs::write(&net_file, "<net></net>").unwrap();
-        let mut config: Config = Config::from_json(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+        let mut config = Config::from_json(include_str!("../../ipc-schema/tests/town.json")).unwrap();
         config.scene.obstacles = vec![OBSTACLE.parse().unwrap()];
         change(&mut config);
         let file = RunFile {

@@ -65,7 +65,7 @@ fn maps() -> PathBuf {
 /// A run over these files; `map` places polygons in latitude and longitude.
 fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
     let town = include_str!("../../ipc-schema/tests/town.json");
-    let config: Config = Config::from_json(town).unwrap();
+    let config = Config::from_json(town).unwrap();
     RunFile {
         schema_version: ipc_schema::SCHEMA_VERSION,
         env_index: 0,

@@ -312,7 +312,7 @@ mod tests {
 
     #[test]
     fn rain_wets_a_dry_road_and_no_other() {
-        let mut config: Config = Config::from_json(include_str!("../../tests/town.json")).unwrap();
+        let mut config = Config::from_json(include_str!("../../tests/town.json")).unwrap();
         assert_eq!(config.surface(), Surface::Dry);
         config.weather.rain_mmph = 2.5;
         assert_eq!(config.surface(), Surface::Wet);

@@ -44,7 +44,7 @@ impl Random {
 
 /// The default configuration with the LIDAR that measurements use: 32 × 1800 rays, 100 m.
 pub fn config() -> Config {
-    let mut config: Config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
     config.lidar.vehicles = 16;
     config
 }

@@ -410,7 +410,7 @@ mod tests {
 
     #[test]
     fn links_are_those_of_each_pair_by_itself_for_any_number_of_threads() {
-        let mut config: Config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+        let mut config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
         config.v2x.range_m = 250.0;
         let houses = (0..36)
             .map(|place| house(f64::from(place % 6) * 70.0, f64::from(place / 6) * 70.0))

@@ -7,7 +7,7 @@ use sim_core::geodesy::Projection;
 
 /// The preset with radios, without fading.
 pub fn config() -> Config {
-    let mut config: Config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = Config::from_json(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
     config.v2x.share = 1.0;
     config.v2x.fading = false;
     config

@@ -56,7 +56,8 @@ class Adam:
 class ModuleAdam:
     """Optimiser state of modules whose gradients come from autograd: the same bits as `torch.optim.Adam`.
 
-    `means` and `squares` are the running moments of each parameter's gradient, `steps` counts its steps.
+    Parameters are real and their gradients dense. `means` and `squares` are the running moments of each
+    parameter's gradient, `steps` counts its steps.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], epsilon: float = 1e-8) -> None:

@@ -17,7 +17,7 @@ fn hash(before: u64, bytes: &[u8]) -> u64 {
 }
 
 fn measure(stations: usize, perception_range_m: f64, threads: u32) {
-    let mut config: Config = Config::from_json(include_str!("../../../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = Config::from_json(include_str!("../../../../ipc-schema/tests/town.json")).unwrap();
     config.v2x.share = 1.0;
     config.v2x.threads = threads;
     config.v2x.perception_range_m = perception_range_m;

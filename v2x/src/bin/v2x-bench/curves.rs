@@ -135,7 +135,7 @@ fn measure(
     sizes: &mut Sizes,
     bins: &mut [[DeliveredShare; 10]; 3],
 ) -> CaseFigures {
-    let mut config: Config = Config::from_json(include_str!("../../../../ipc-schema/tests/town.json")).unwrap();
+    let mut config = Config::from_json(include_str!("../../../../ipc-schema/tests/town.json")).unwrap();
     config.v2x.share = share;
     config.v2x.listing = V2xListing::Separate;
     config.v2x.neighbours = 256;
