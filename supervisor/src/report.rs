@@ -517,9 +517,11 @@ fn resynchronisations(report: &Value) -> Option<String> {
     );
     #[expect(clippy::cast_precision_loss, reason = "a rate for readers")]
     let rate = 1e6 * set as f64 / steps as f64;
+    // Two of seven million are not none.
+    let decimals = if set > 0 && rate < 10.0 { 2 } else { 0 };
     let reasons = commonest_causes(parts, "resynchronisation_causes");
     Some(format!(
-        "mirrors set onto SUMO: {set} ({rate:.0} per million vehicle-ticks){reasons}"
+        "mirrors set onto SUMO: {set} ({rate:.decimals$} per million vehicle-ticks){reasons}"
     ))
 }
 
@@ -651,6 +653,20 @@ mod tests {
         assert_eq!(evaluated_before(&report(40, "interrupted")), "");
         assert_eq!(evaluated_before(&report(12, "completed")), "");
         assert_eq!(evaluated_before(&json!({})), "");
+    }
+
+    #[test]
+    fn a_small_rate_of_jumps_is_not_rounded_to_none() {
+        let line = |set: u64| {
+            let dynamics = json!({"resynchronisations": set, "vehicle_steps": 7_000_000});
+            resynchronisations(&json!({"environments": [{"dynamics": dynamics}]})).unwrap()
+        };
+        assert_eq!(line(0), "mirrors set onto SUMO: 0 (0 per million vehicle-ticks)");
+        assert_eq!(line(2), "mirrors set onto SUMO: 2 (0.29 per million vehicle-ticks)");
+        assert_eq!(
+            line(1400),
+            "mirrors set onto SUMO: 1400 (200 per million vehicle-ticks)"
+        );
     }
 
     #[test]
