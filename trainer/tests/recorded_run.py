@@ -55,6 +55,7 @@ TRAINED = {
     "episode.final_evaluations": 2,
     "episode.evaluation_ticks": 60,
     "trainer.horizon": 500,
+    "trainer.plots": "false",
     "trainer.batch_size": 250,
     "fanout.enabled": "false",
     "record.chunk_mib": 1,

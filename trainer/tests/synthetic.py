@@ -185,6 +185,7 @@ def run_file(run_dir: str, **trainer: object) -> dict[str, Any]:
         "hidden": [32, 16],
         "horizon": 256,
         "batch_size": 64,
+        "plots": False,
     }
     section = dict.fromkeys(OPTIONAL_KEYS) | PRESET["trainer"] | small | {"checkpoint_interval": 10} | trainer
     config = {

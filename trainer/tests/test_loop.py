@@ -48,7 +48,8 @@ def final_parameters(tmp_path: Path) -> dict[str, torch.Tensor]:
 
 
 def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
-    channel = loop_over(tmp_path, with_evaluation(100, 20, 16, 5.0, seed=1))
+    run = run_file(str(tmp_path), plots=True)
+    channel = loop_over(tmp_path, with_evaluation(100, 20, 16, 5.0, seed=1), run=run)
     report = part(tmp_path)
     assert (report["env_steps"], report["updates"], report["vehicles"]) == (1600, 6, 16)
     assert (report["received_ticks"], report["lost_ticks"], report["duplicated_ticks"]) == (140, 0, 0)
@@ -66,6 +67,12 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     for name in ("error.png", "sigma.png"):
         assert (tmp_path / "plots" / name).read_bytes().startswith(PNG)
     assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+def test_a_run_without_plots_draws_none(tmp_path: Path) -> None:
+    loop_over(tmp_path, with_evaluation(100, 20, 16, 5.0, seed=1), run=run_file(str(tmp_path), plots=False))
+    assert part(tmp_path)["updates"] == 6
+    assert not (tmp_path / "plots").exists()
 
 
 def test_an_evaluation_measures_policy_and_raw_gnss_on_the_same_valid_rows(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def registry() -> Iterator[Path]:
 
 
 def start(folder: Path, registry: Path, words: list[str], horizon: int, *more: str) -> subprocess.Popen[str]:
-    sizes = {"trainer.horizon": horizon, "trainer.batch_size": horizon // 2}
+    sizes = {"trainer.horizon": horizon, "trainer.batch_size": horizon // 2, "trainer.plots": "false"}
     settings = [f"--set={key}={value}" for key, value in (SETTINGS | sizes).items()]
     return launch(folder, registry, [*words, "town", *settings, *(f"--set={setting}" for setting in more)])
 

@@ -30,6 +30,7 @@ SETTINGS = {
     # The first checkpoint is that of the handover.
     "trainer.checkpoint_interval": 1000,
     "trainer.supervised": "false",
+    "trainer.plots": "false",
     "fanout.enabled": "false",
     "run.real_time_factor": 20,
 }

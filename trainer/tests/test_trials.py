@@ -41,6 +41,7 @@ SMALL = {
     "episode.evaluation_ticks": 30,
     "episode.final_evaluations": 1,
     "trainer.horizon": 64,
+    "trainer.plots": "false",
     "trainer.batch_size": 32,
     "trainer.hidden": "[16]",
     "fanout.enabled": "false",

@@ -137,6 +137,7 @@ def learner_config(
         checkpoints_kept=5,
         checkpoint_keep_every=0,
         estimates=EstimateTimes.NEVER,
+        plots=False,
         images=None,
     )
 

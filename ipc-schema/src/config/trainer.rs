@@ -82,6 +82,8 @@ pub struct TrainerConfig {
     pub checkpoint_keep_every: u64,
     /// When the Kalman filter's estimates travel beside the predictions.
     pub estimates: Estimates,
+    /// Draw the plots of a run at its end.
+    pub plots: bool,
 }
 
 /// Reward of a prediction, a function of its Euclidean distance d from the truth.

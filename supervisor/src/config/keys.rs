@@ -495,6 +495,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("trainer.checkpoints_kept", "", 1, 1_000_000, "Number of newest checkpoints that are kept; the one with the best evaluation is kept as well."),
     integer("trainer.checkpoint_keep_every", "updates", 0, 1_000_000, "Every checkpoint after a multiple of this many updates is kept for good; 0 = none."),
     other("trainer.estimates", ValueKind::Choice(&["paced", "always", "never"]), "When the Kalman filter runs beside the policy for viewers: in runs paced by `run.real_time_factor`, always, or never. At full speed it costs more than the policy."),
+    other("trainer.plots", ValueKind::Flag, "Draw `plots/` when the run ends, which takes the trainer about a second. The same figures are in `learning.jsonl` and in TensorBoard's events, and `caraware report` draws its own plots."),
     other("fusion.map", ValueKind::Flag, "The learned estimator of `caraware.fusion.train` uses the lanes of the net."),
     integer("fusion.segment_ticks", "ticks", 1, 1_000_000, "The estimator learns from an episode in pieces of this many ticks, side by side."),
     integer("fusion.truncation_ticks", "ticks", 1, 1_000_000, "Ticks between two gradient steps, over which a gradient propagates back; divides `fusion.segment_ticks`."),

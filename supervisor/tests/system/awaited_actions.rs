@@ -20,7 +20,7 @@ struct WaitingWorld {
     achieved: fn(&Value) -> Value,
 }
 
-const SMALL: [&str; 13] = [
+const SMALL: [&str; 14] = [
     "run.envs=2",
     "traffic.others=3",
     "traffic.pedestrians=2",
@@ -30,6 +30,7 @@ const SMALL: [&str; 13] = [
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
     "trainer.horizon=300",
+    "trainer.plots=false",
     "trainer.batch_size=150",
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",

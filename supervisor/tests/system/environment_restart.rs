@@ -13,7 +13,7 @@ use rustix::process::{Pid, Signal, kill_process};
 const SIMULATORS: [&str; 3] = ["traffic-bridge", "sim-core", "sensor-daemon"];
 
 /// A few vehicles, four episodes with an evaluation between. Small networks, and no estimates that only viewers see.
-const SMALL: [&str; 15] = [
+const SMALL: [&str; 16] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -23,6 +23,7 @@ const SMALL: [&str; 15] = [
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
     "trainer.horizon=300",
+    "trainer.plots=false",
     "trainer.batch_size=150",
     "trainer.hidden=[32, 32]",
     "trainer.estimates=never",

@@ -15,7 +15,7 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Four vehicles, three training episodes, one evaluation in between and one at the end: 400 ticks, 8 updates with two environments.
-const SMALL: [&str; 13] = [
+const SMALL: [&str; 14] = [
     "traffic.cavs=4",
     "traffic.others=2",
     "traffic.pedestrians=2",
@@ -25,6 +25,7 @@ const SMALL: [&str; 13] = [
     "episode.evaluation_ticks=50",
     "episode.final_evaluations=1",
     "trainer.horizon=256",
+    "trainer.plots=false",
     "trainer.batch_size=128",
     "trainer.hidden=[32, 32]",
     "trainer.checkpoint_interval=2",

@@ -20,7 +20,7 @@ use serde_json::Value;
 
 /// Six vehicles, six training episodes with two evaluations in between: 1 400 ticks, 24 updates, a checkpoint for every second update.
 /// Small networks, and no estimates that only viewers see.
-const SMALL: [&str; 15] = [
+const SMALL: [&str; 16] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -30,6 +30,7 @@ const SMALL: [&str; 15] = [
     "episode.evaluation_ticks=50",
     "episode.final_evaluations=2",
     "trainer.horizon=300",
+    "trainer.plots=false",
     "trainer.batch_size=150",
     "trainer.hidden=[32, 32]",
     "trainer.estimates=never",

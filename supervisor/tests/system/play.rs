@@ -7,7 +7,7 @@ use ipc_schema::{process::Process, services::Channel};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-const SMALL: [&str; 11] = [
+const SMALL: [&str; 12] = [
     "traffic.cavs=4",
     "traffic.others=2",
     "traffic.pedestrians=0",
@@ -16,6 +16,7 @@ const SMALL: [&str; 11] = [
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
     "trainer.horizon=150",
+    "trainer.plots=false",
     "trainer.batch_size=75",
     "trainer.hidden=[32, 32]",
     "fanout.enabled=false",

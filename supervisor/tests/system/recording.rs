@@ -16,7 +16,7 @@ use recorder::file::{
 use rustix::process::{Pid, Signal, kill_process};
 
 /// A short training run of six vehicles with small networks, without viewers.
-const SHORT: [&str; 12] = [
+const SHORT: [&str; 13] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -26,6 +26,7 @@ const SHORT: [&str; 12] = [
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=2",
     "trainer.horizon=900",
+    "trainer.plots=false",
     "trainer.batch_size=300",
     "trainer.hidden=[32, 32]",
     "fanout.enabled=false",

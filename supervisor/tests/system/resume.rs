@@ -13,7 +13,7 @@ use serde_json::Value;
 
 /// Six vehicles, four training episodes with one evaluation in between: 640 ticks of which 80 are evaluations, a checkpoint for every
 /// update. Small networks, and no estimates that only viewers see.
-const SMALL: [&str; 16] = [
+const SMALL: [&str; 17] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -23,6 +23,7 @@ const SMALL: [&str; 16] = [
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
     "trainer.horizon=300",
+    "trainer.plots=false",
     "trainer.batch_size=150",
     "trainer.hidden=[32, 32]",
     "trainer.estimates=never",

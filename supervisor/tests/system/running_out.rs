@@ -23,7 +23,7 @@ use crate::common::{Workplace, free_port, text, until, with_mounts};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, prlimit};
 
 /// A short training run of six vehicles, without viewers.
-const SHORT: [&str; 11] = [
+const SHORT: [&str; 12] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -32,6 +32,7 @@ const SHORT: [&str; 11] = [
     "episode.evaluation_interval=2",
     "episode.evaluation_ticks=40",
     "trainer.checkpoint_interval=1",
+    "trainer.plots=false",
     "trainer.horizon=900",
     "trainer.batch_size=300",
     "fanout.enabled=false",

@@ -7,7 +7,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::{Value, json};
 
 /// Six vehicles with images of 24 × 24, and an update every 240 samples.
-const SMALL: [&str; 18] = [
+const SMALL: [&str; 19] = [
     "traffic.cavs=6",
     "traffic.others=2",
     "episode.ticks=110",
@@ -21,6 +21,7 @@ const SMALL: [&str; 18] = [
     "trainer.frames=3",
     "trainer.hidden=[16]",
     "trainer.horizon=480",
+    "trainer.plots=false",
     "trainer.batch_size=240",
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",

@@ -14,7 +14,7 @@ use serde_json::Value;
 
 /// Six vehicles, 1 000 ticks with an evaluation in the middle, a checkpoint for every update. Small networks, and no estimates that only
 /// viewers see.
-const SMALL: [&str; 15] = [
+const SMALL: [&str; 16] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -24,6 +24,7 @@ const SMALL: [&str; 15] = [
     "episode.evaluation_ticks=50",
     "episode.final_evaluations=1",
     "trainer.horizon=300",
+    "trainer.plots=false",
     "trainer.batch_size=150",
     "trainer.hidden=[32, 32]",
     "trainer.estimates=never",

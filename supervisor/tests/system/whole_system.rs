@@ -40,8 +40,10 @@ fn small<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
 }
 
 const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
-/// Small networks and one evaluation at the end, for runs in which what is learnt does not matter.
-const LIGHT: [&str; 4] = [
+/// Small networks, one evaluation at the end and no plots, for runs in which what is learnt does not matter.
+const LIGHT: [&str; 6] = [
+    "--set",
+    "trainer.plots=false",
     "--set",
     "trainer.hidden=[32, 32]",
     "--set",

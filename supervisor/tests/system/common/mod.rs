@@ -379,13 +379,14 @@ impl Spectator {
 
 /// A curriculum on the preset `paper`: three stages, of which the first continues without restarts, a horizon that ends within lessons,
 /// and gates of σ that some updates pass.
-pub const CURRICULUM: [&str; 13] = [
+pub const CURRICULUM: [&str; 14] = [
     "curriculum.stages=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
     "episode.ticks=450",
     "episode.training_episodes=60",
     "episode.evaluation_ticks=80",
     "episode.final_evaluations=1",
     "trainer.horizon=500",
+    "trainer.plots=false",
     "trainer.batch_size=100",
     "trainer.hidden=[32, 32]",
     "trainer.estimates=never",

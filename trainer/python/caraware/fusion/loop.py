@@ -134,16 +134,20 @@ class FusionLoop:
         self._metrics.close()
         if self._left:
             return False
-        # Loaded here: matplotlib takes a fifth of the time in which a trainer starts.
-        from caraware.report.plots import plot_headline
-
-        folder = self._config.run_dir / "plots"
-        plot_headline(folder, self._headline, self._metrics.training, self._metrics.evaluations)
+        if self._config.trainer.plots:
+            self._draw()
         self._write_part()
         if self._ended:
             self._channel.done()
         log.info("%s after %d updates", "run complete" if self._ended else "stopped", self._learner.updates)
         return True
+
+    def _draw(self) -> None:
+        # Loaded here: matplotlib takes a fifth of the time in which a trainer starts.
+        from caraware.report.plots import plot_headline
+
+        folder = self._config.run_dir / "plots"
+        plot_headline(folder, self._headline, self._metrics.training, self._metrics.evaluations)
 
     def _process(self, obs: Observation) -> None:
         """Publish the estimate of one tick; only then read its truth, to evaluate or to record it."""

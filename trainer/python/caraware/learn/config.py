@@ -132,6 +132,8 @@ class TrainerConfig:
     checkpoint_keep_every: int
     """Checkpoints after a multiple of so many updates stay for good; 0: only the newest and the best."""
     estimates: EstimateTimes
+    plots: bool
+    """Draw the plots of a run at its end."""
     images: ImageShape | None
     """Those in the observations; None where they hold none."""
 

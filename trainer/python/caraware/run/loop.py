@@ -100,7 +100,8 @@ class TrainingLoop:
         if self._learner is not None and self._updates() != self._checkpoints.saved_updates:
             self.commit()
         self._metrics.close()
-        self._draw()
+        if self._config.trainer.plots:
+            self._draw()
         self._write_part()
         if self._ranks.all(self._ended()):
             self._ranks.note_end()
