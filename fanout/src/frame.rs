@@ -5,6 +5,7 @@ use ipc_schema::{
     block::{BlockError, Section, view},
     event::CollisionLayout,
     header::{DIMENSIONS, MessageHeader},
+    neighbours::NeighboursLayout,
     observation::{EMPTY_SLOT, ObservationLayout},
     pointcloud::{LidarPoint, PointcloudLayout, Scan},
     prediction::PredictionLayout,
@@ -46,7 +47,8 @@ pub struct EncodedFrame {
 ///
 /// A frame of `world` has neither sub-steps nor views of heroes. If there are more road users or slots of an observation than fit, it has
 /// those that come first by [`sampling_order`], in every tick the same; of more points than fit, every second (third, …).
-/// A prediction has the slots of its observation ([`encode_prediction`]); alone, its first ones.
+/// A prediction and what is known from messages have the slots of their observation ([`encode_prediction`], [`encode_neighbours`]); alone,
+/// their first ones.
 ///
 /// # Errors
 /// The payload is shorter than its header promises, or the frame is too long.
@@ -58,6 +60,7 @@ pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Resul
             encode_slots(header, payload, chosen.as_deref(), observation_layout(header))
         }
         Channel::Prediction => encode_prediction(header, payload, None),
+        Channel::Neighbours => encode_neighbours(header, payload, None),
         Channel::Pointcloud => encode_scan(header, payload),
         _ => encode_collisions(header, payload),
     }
@@ -131,6 +134,30 @@ pub fn encode_prediction(
             layout.len,
         )
     })
+}
+
+/// Encodes what road users know from messages, with the slots of the observation's frame. What the policy of the messages task sees and what
+/// messages have achieved are left out. Without `chosen` it has all slots, or its first ones.
+///
+/// # Errors
+/// As [`encode`].
+pub fn encode_neighbours(
+    header: &MessageHeader,
+    payload: &[u8],
+    chosen: Option<&[usize]>,
+) -> Result<EncodedFrame, FrameError> {
+    let [_, nearest, _] = dimensions(header);
+    // What is left out comes last, so that the sections before it stay where they are.
+    let layout_of = |rows| {
+        let layout = NeighboursLayout::sized(rows, nearest, 0, 0);
+        (
+            layout.named().map(|(_, section)| section).to_vec(),
+            layout.shape,
+            layout.len,
+        )
+    };
+    let (_, shape, _) = layout_of(header.rows());
+    encode_slots(&MessageHeader { shape, ..*header }, payload, chosen, layout_of)
 }
 
 /// Sections, shape and length of an observation with a number of slots. Its images, which are too large for a frame, are left out.

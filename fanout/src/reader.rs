@@ -4,6 +4,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     event::Collision,
     header::MessageHeader,
+    neighbours::NeighboursLayout,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::PredictionLayout,
@@ -85,6 +86,7 @@ fn promised(topic: &str, header: &MessageHeader) -> Option<usize> {
         "event" => rows_of(size_of::<Collision>()),
         "prediction" => PredictionLayout::of(header).len,
         "observation" => ObservationLayout::of(header).len,
+        "neighbours" => NeighboursLayout::of(header).len,
         topic if topic.starts_with("pointcloud/") => {
             let layout = PointcloudLayout::of(header);
             layout.points.offset.saturating_add(layout.points.len)
@@ -99,7 +101,7 @@ mod tests {
 
     use super::*;
 
-    const TOPICS: [&str; 10] = [
+    const TOPICS: [&str; 11] = [
         "map",
         "status",
         "vehicles",
@@ -107,6 +109,7 @@ mod tests {
         "world",
         "observation",
         "prediction",
+        "neighbours",
         "event",
         "pointcloud/a",
         "other",

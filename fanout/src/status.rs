@@ -64,6 +64,7 @@ pub fn map_json(run: &RunFile, env: u32) -> Result<String, serde_json::Error> {
             ("world", fanout.world_hz),
             ("observation", fanout.observation_hz),
             ("prediction", fanout.prediction_hz),
+            ("neighbours", fanout.neighbours_hz),
             ("pointcloud", fanout.pointcloud_hz),
             ("event", fanout.event_hz),
             ("signals", fanout.signals_hz),
@@ -175,7 +176,7 @@ impl FanoutCounters {
     /// The counter of the rows that frames of `topic` leave out.
     pub fn left_out(&mut self, topic: Topic) -> &mut u64 {
         match topic {
-            Topic::Observation | Topic::Prediction => &mut self.cut_rows,
+            Topic::Observation | Topic::Prediction | Topic::Neighbours => &mut self.cut_rows,
             _ => &mut self.thinned_rows,
         }
     }

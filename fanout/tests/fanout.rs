@@ -8,8 +8,8 @@ use std::{io::Write as _, mem::offset_of, net::TcpStream};
 use bytemuck::{cast_slice, pod_read_unaligned};
 use fanout::{frame::HEADER_BYTES, network::keys::Topic};
 use harness::{
-    PATIENCE, Run, ask, header, next, observation, publisher, send, send_census, send_observation, send_prediction,
-    send_scan, send_world, states, until, watch,
+    PATIENCE, Run, ask, header, neighbours, next, observation, publisher, send, send_census, send_neighbours,
+    send_observation, send_prediction, send_scan, send_world, states, until, watch,
 };
 use ipc_schema::{
     SCHEMA_VERSION,
@@ -72,6 +72,59 @@ fn frames_are_the_bytes_of_shared_memory() {
     for frames in [&world, &seen] {
         assert_eq!(next(frames).0.tick, 3);
     }
+}
+
+/// What road users know from messages goes out with its tick while a viewer subscribes, without what a policy alone may see, and costs
+/// no other topic a tick.
+#[test]
+fn what_is_known_from_messages_goes_to_those_who_subscribe() {
+    let run = Run::with_settings("messages", Mode::Simulate, 50.0, |config| config.v2x.share = 1.0);
+    let mut fanout = run.start_fanout();
+    let viewer = run.attach();
+    let world = watch(&viewer, run.key(Topic::World));
+    let (sim, worlds) = publisher(&run, Channel::World);
+    let (radios, known) = publisher(&run, Channel::Neighbours);
+    until("attendance", || {
+        sim.board_of(Process::Fanout).unwrap().progress().attached == 1
+    });
+
+    // Without a subscriber the tick goes out when the others have it.
+    send_world(&sim, &worlds, 0, 0, 5);
+    assert_eq!(next(&world).0.tick, 0);
+    send_neighbours(&radios, &known, 0, 0, 4);
+    assert!(ask(&viewer, &run.key(Topic::Neighbours)).is_none());
+
+    let heard = watch(&viewer, run.key(Topic::Neighbours));
+    let mut tick = 0;
+    until("a frame of what is known", || {
+        tick += 1;
+        send_world(&sim, &worlds, tick, 0, 5);
+        send_neighbours(&radios, &known, tick, 0, 4);
+        std::thread::park_timeout(std::time::Duration::from_millis(30));
+        ask(&viewer, &run.key(Topic::Neighbours)).is_some()
+    });
+    let (header, payload) = next(&heard);
+    let (layout, expected) = neighbours(header.tick, 4, 0);
+    assert_eq!(header.shape, layout.shape);
+    // What lies between two sections is not part of any.
+    for (_, section) in layout.named() {
+        let part = section.offset..section.offset + section.len;
+        assert_eq!(payload[part.clone()], expected[part]);
+    }
+    assert_eq!(payload.len(), layout.len);
+
+    tick += 1;
+    send_world(&sim, &worlds, tick, LAST_OF_RUN, 5);
+    send_neighbours(&radios, &known, tick, LAST_OF_RUN, 4);
+    assert_eq!(fanout.exit_code(), Some(0));
+    let last = |frames| {
+        let mut newest = next(frames).0.tick;
+        while newest < tick {
+            newest = next(frames).0.tick;
+        }
+        newest
+    };
+    assert_eq!((last(&world), last(&heard)), (tick, tick));
 }
 
 /// A viewer that joins late gets the whole picture from one query, and the liveliness token disappears with the run.

@@ -17,10 +17,11 @@ use ipc_schema::{
     services::Channel,
 };
 
-const TOPICS: [&str; 14] = [
+const TOPICS: [&str; 15] = [
     "world",
     "observation",
     "prediction",
+    "neighbours",
     "pointcloud/cav.1",
     "pointcloud",
     "event",

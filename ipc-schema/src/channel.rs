@@ -439,7 +439,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         required: &[Trainer, Recorder],
         paced_by: Channel::Neighbours,
         window: RunFile::window_ticks,
-        topics: &[],
+        topics: &["neighbours"],
         when_full: FullQueue::DropNewest,
         max_payload: |run| match run.config.v2x.is_on() {
             true => NeighboursLayout::of_config(&run.config, road_users(run)).len,

@@ -329,6 +329,7 @@ const VIEW: &str = "Examples:
   caraware view --save run.rrd           record; open it later with `.venv/bin/rerun run.rrd`
   caraware view town-2                   show one of several runs
   caraware view --vehicle cav.3 --lidar all
+  caraware view --messages               what a vehicle knows from V2X messages, and its links
   caraware view tcp/127.0.0.1:7448       connect to an endpoint (`fanout.listen` of a run)
 
 Several viewers may connect and leave at any time: no viewer delays the run. Ctrl-C ends only the viewer.
@@ -356,6 +357,9 @@ pub struct ViewArgs {
     /// Points of the LIDARs: those on road users, with the range ring (interest); all; or none (off) [default: interest]
     #[arg(long, value_parser = ["interest", "all", "off"])]
     pub lidar: Option<String>,
+    /// What the followed vehicle knows from V2X messages, its links, and which stations have just sent
+    #[arg(long)]
+    pub messages: bool,
     /// Environment of the run [default: its first]
     #[arg(long, value_name = "N")]
     pub env: Option<u32>,

@@ -69,6 +69,23 @@ def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None 
     return header(tick, len(position_m), columns, len(estimate_m)) + first + second
 
 
+def neighbours(tick: int, known: dict[int, list[tuple[list[float], tuple[int, int, int]]]], **fields: Any) -> bytes:
+    """What vehicles know, by slot: the numbers and the identity of each object. Vehicle = slot, each has a radio."""
+    n, k = len(known), max([len(objects) for objects in known.values()] + [1])
+    objects, ids = np.zeros((n, k, 11), np.float32), np.zeros((n, k, 3), np.uint32)
+    for slot, rows in known.items():
+        for place, (numbers, identity) in enumerate(rows):
+            objects[slot, place], ids[slot, place] = numbers, identity
+    radio = np.tile(np.array([1, 0, 0, 0, 0]), (n, 1))
+    arrays = {"objects": objects, "ids": ids, "radio": radio, "vehicle": np.arange(n)} | fields
+    payload = b""
+    for section in layout.SECTIONS["neighbours"]:
+        shape = section.sized({"slots": n, "nearest": k, "speakers": 0, "inputs": 0})
+        payload += np.asarray(arrays.get(section.name, np.zeros(shape)), section.element).reshape(shape).tobytes()
+        payload += bytes(-len(payload) % layout.ALIGNMENT)
+    return header(tick, n, k) + payload
+
+
 def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
     rows = np.zeros(len(names), wire.VEHICLE_META)
     for row, (id_hash, name) in zip(rows, names.items(), strict=True):

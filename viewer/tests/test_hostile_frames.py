@@ -24,6 +24,7 @@ DECODERS: list[tuple[Callable[[bytes], object], bytes]] = [
     (wire.decode_world, frames.world(4, count=5)),
     (wire.decode_observation, frames.observation(1, TRUTH, TRUTH)),
     (wire.decode_prediction, frames.prediction(0, TRUTH, TRUTH)),
+    (wire.decode_neighbours, frames.neighbours(3, {0: [([1.0] * 11, (5, 6, 1))], 1: []})),
     (wire.decode_cloud, frames.pointcloud(3, {"position_m": np.zeros((3, 3)), "tag": [0, 4, 6]})),
     (lambda frame: wire.decode_table(frame, wire.VEHICLE_META), frames.vehicles(3, {5: "a", 6: "b"})),
     (lambda frame: wire.decode_table(frame, wire.SIGNAL_META), frames.signals(3, {9: "rGy"})),

@@ -13,7 +13,7 @@ import pytest
 import recordings
 import rerun as rr
 
-from caraware_viewer import course, detail, plots, scene, space, static_map, top, wire
+from caraware_viewer import course, detail, legend, messages, plots, scene, space, static_map, top, wire
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import Sample
 from caraware_viewer.scene import Scene
@@ -300,6 +300,68 @@ def test_routes_of_heroes_and_their_lights_are_drawn_while_they_are_on_the_road(
     assert len(found[space.ROUTES].rows[0][1]["LineStrips3D:strips"]) == 1
 
 
+KNOWN: dict[int, list[tuple[list[float], tuple[int, int, int]]]] = {
+    0: [
+        # Vehicle 1 itself, measured 0.5 s ago at 4 m/s; a pedestrian that it perceives; a unit beside the road.
+        ([12, 50, 4, 0, 0, 4.5, 1.8, 0.5, 0.4, 0.1, 0.01], (101, 101, 1)),
+        ([30, 60, 0, 1, 1.5, 0, 0, 1.0, 1.0, 0.2, 0.1], (0, 101, 2)),
+        ([80, 80, 0, 0, 0, 0, 0, 2.0, 0.1, 0.0, 0.0], (900, 900, 1)),
+    ],
+    1: [],
+}
+RADIO = np.array([[1, 3, 0, 0, 2], [1, 0, 2, 250, 0]])
+
+
+def test_the_map_of_the_followed_vehicle_and_its_links_are_drawn(drawn: Drawn) -> None:
+    scene, found = drawn(
+        ("world", frames.world(4, vehicle=np.arange(3), kind=wire.CAV)),
+        ("neighbours", frames.neighbours(4, KNOWN, radio=RADIO, channel_load=[0.25, 0.0])),
+        ("world", frames.world(5, vehicle=np.arange(3), kind=wire.CAV)),
+        messages=True,
+    )
+    # Boxes stand where the objects are by now: the first corner of an outline is the rear left one.
+    outlines = np.array(found[messages.KNOWN].newest("LineStrips2D:strips"))
+    assert outlines.shape == (3, 8, 2)
+    np.testing.assert_allclose(outlines[0, 0], [12 + 0.5 * 4 - 4.5 / 2, -(50 + 0.9)], atol=1e-5)
+    np.testing.assert_allclose(outlines[1].mean(axis=0), [30, -(60 + 1)], atol=0.2)
+    assert found[messages.KNOWN].newest("LineStrips2D:colors") == messages.SOURCE_COLORS[[1, 2, 1]].tolist()
+    circles = np.array(found[messages.DEVIATIONS].newest("LineStrips2D:strips"))
+    np.testing.assert_allclose(np.ptp(circles[:, :, 0], axis=1) / 2, [0.98, 2.45, 0.245], atol=1e-3)
+    near(found[messages.KNOWN_IN_SPACE], "Boxes3D:centers", [[14, 50, 0.75], [30, 61, 0.75], [80, 80, 0.75]])
+    # Two stations were heard: vehicle 1, where it is, brighter as it is fresher, and the unit, where it says it is.
+    middle = [2.25 - 1.0 + 4, -50.0]
+    near(found[messages.LINKS], "LineStrips2D:strips", [[[middle[0] + 10, -50], middle], [[80, -80], middle]])
+    fresh, old = (int(color) & 0xFF for color in found[messages.LINKS].newest("LineStrips2D:colors"))
+    assert fresh > old == 0xFF - 0xC0
+    # Vehicle 1 has just sent.
+    rings = np.array(found[messages.SENDERS].newest("LineStrips2D:strips"))
+    np.testing.assert_allclose(rings.mean(axis=1), [[middle[0] + 10, -50]], atol=0.1)
+    text = found["hud"].newest("TextDocument:text")[0]
+    assert "| radio | 0 sent (0 B) · 2 received · channel 25 % busy |" in text
+    assert "| knows | 3 objects · CAM 2 · CPM 1 |" in text
+    assert "known by CPM" in found[legend.SIGNS].newest("Points2D:labels")
+    assert scene.refused == 0
+
+
+def test_a_vehicle_with_a_radio_is_followed_where_messages_are_shown(drawn: Drawn) -> None:
+    world = frames.world(4, vehicle=np.arange(3), kind=wire.CAV)
+    radio = np.array([[0, 0, 0, 0, 0], [1, 0, 0, 0, 0]])
+    frame = frames.neighbours(4, {0: [], 1: []}, radio=radio)
+    scene, _ = drawn(("world", world), ("neighbours", frame), messages=True)
+    assert scene.cloud_vehicles() == [] and scene.followed == [101]
+    scene, _ = drawn(("world", world))
+    assert scene.followed == [100]
+    scene, _ = drawn(
+        ("world", world), ("neighbours", frame), ("vehicles", frames.vehicles(4, {100: "a"})), wanted=["a"]
+    )
+    assert scene.followed == [100]
+
+
+def test_without_messages_the_legend_does_not_name_them(drawn: Drawn) -> None:
+    _, found = drawn(("world", frames.world(4)))
+    assert "known by CPM" not in found[legend.SIGNS].newest("Points2D:labels")
+
+
 def test_the_status_is_plotted_and_in_the_hud(drawn: Drawn) -> None:
     _, found = drawn(("status", json.dumps(STATUS).encode()), ("world", frames.world(2)))
     for path, value in ((plots.STEPS, 250.0), (plots.REAL_TIME, 5.0), (plots.VEHICLES, 6.0), (plots.PERSONS, 0.0)):
@@ -380,6 +442,7 @@ def test_random_bytes_are_refused_on_every_topic(drawn: Drawn) -> None:
     recording = rr.RecordingStream("test", recording_id="garbage")
     drawing = Scene(recording, cast(RunMap, MAP))
     topics = ("world", "observation", "prediction", "status", "learning", "vehicles", "signals", "routes", "event")
+    topics = (*topics, "neighbours")
     for topic in (*topics, "pointcloud/a"):
         for size in (0, 1, 95, 96, 500, 4000):
             with pytest.raises(wire.FrameError):

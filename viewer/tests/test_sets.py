@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from caraware_viewer.sets import TickSets
+from caraware_viewer.sets import TICK_TOPICS, TickSets
 
 RUN = 7
 
@@ -64,6 +64,14 @@ def test_a_topic_that_is_off_is_waited_for_only_at_first(sets: TickSets[str], cl
     sets.take()
     add(sets, 4, "world")
     assert not sets.ready()
+
+
+def test_messages_are_waited_for_where_they_are_subscribed_to(clock: Clock) -> None:
+    sets: TickSets[str] = TickSets(clock, TICK_TOPICS)
+    add(sets, 1, "world", "observation", "prediction")
+    assert not sets.ready()
+    add(sets, 1, "neighbours")
+    assert list(sets.take()) == ["world", "observation", "prediction", "neighbours"]
 
 
 def test_a_lost_frame_delays_its_tick_and_no_later_one(sets: TickSets[str], clock: Clock) -> None:

@@ -79,6 +79,36 @@ fn a_crowd_is_sampled_by_id_and_counted() {
 }
 
 #[test]
+fn what_is_known_from_messages_has_the_slots_of_its_observation_and_nothing_that_a_policy_sees() {
+    let layout = NeighboursLayout::sized(5, 3, 5, 8);
+    let words = payload(layout.len);
+    let bytes: &[u8] = cast_slice(&words);
+    for chosen in [None, Some(vec![1, 4])] {
+        let rows = chosen.clone().unwrap_or_else(|| (0..5).collect());
+        let frame = encode_neighbours(&header(layout.shape), bytes, chosen.as_deref()).unwrap();
+        let (head, body) = decode(&frame.bytes).unwrap();
+        let short = NeighboursLayout::of(&head);
+        assert_eq!(head.shape, NeighboursLayout::sized(rows.len(), 3, 0, 0).shape);
+        assert_eq!((body.len(), frame.left_out), (short.len, 5 - rows.len()));
+        for ((name, from), (_, to)) in layout.named().into_iter().zip(short.named()) {
+            if ["speech", "achieved"].contains(&name) {
+                assert_eq!(to.len, 0);
+                continue;
+            }
+            let row = to.len / rows.len();
+            let kept = rows.iter().flat_map(|slot| &bytes[from.offset + slot * row..][..row]);
+            assert!(body[to.offset..][..to.len].iter().eq(kept), "{name}");
+        }
+    }
+    // Of more slots than fit, the first ones.
+    let crowd = NeighboursLayout::sized(3_000, 16, 0, 0);
+    let words = payload(crowd.len);
+    let frame = encode(Channel::Neighbours, &header(crowd.shape), cast_slice(&words)).unwrap();
+    assert!((850_000..=MAX_FRAME_BYTES).contains(&frame.bytes.len()));
+    assert!(frame.left_out > 1_500);
+}
+
+#[test]
 fn a_prediction_has_the_slots_of_its_observation() {
     let layout = ObservationLayout::new(10_000, 9, 1);
     let mut words = payload(layout.len);

@@ -27,13 +27,15 @@ pub enum Topic {
     Observation,
     /// Predictions of the policy and estimates of the filter, as a frame.
     Prediction,
+    /// What connected vehicles know from messages, as a frame; published while a viewer subscribes.
+    Neighbours,
     /// Contacts that begin in a tick, as a frame.
     Event,
 }
 
 impl Topic {
     /// All topics.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Map,
         Self::Status,
         Self::Learning,
@@ -43,6 +45,7 @@ impl Topic {
         Self::World,
         Self::Observation,
         Self::Prediction,
+        Self::Neighbours,
         Self::Event,
     ];
 
@@ -59,6 +62,7 @@ impl Topic {
             Self::World => Channel::World.name(),
             Self::Observation => Channel::Observation.name(),
             Self::Prediction => Channel::Prediction.name(),
+            Self::Neighbours => Channel::Neighbours.name(),
             Self::Event => Channel::Event.name(),
         }
     }

@@ -243,6 +243,12 @@ impl EnvironmentPublisher {
     fn has_subscriber(&self) -> bool {
         self.topics.values().any(KeyPublisher::has_subscriber)
     }
+
+    /// True while a client subscribes to the topic.
+    #[must_use]
+    pub fn is_watched(&self, topic: Topic) -> bool {
+        self.topics.get(&topic).is_some_and(KeyPublisher::has_subscriber)
+    }
 }
 
 /// Closes the session after what is queued for viewers, if there are any, has been sent. zenoh does not report when its queues are empty,
@@ -289,7 +295,7 @@ fn priority(topic: Topic) -> Priority {
         Topic::Map | Topic::Status | Topic::Learning | Topic::Signals | Topic::Event => Priority::InteractiveLow,
         Topic::Prediction => Priority::DataHigh,
         Topic::World => Priority::Data,
-        Topic::Observation | Topic::Vehicles | Topic::Routes => Priority::DataLow,
+        Topic::Observation | Topic::Neighbours | Topic::Vehicles | Topic::Routes => Priority::DataLow,
     }
 }
 

@@ -1,5 +1,5 @@
-//! The topics of a tick: `world`, `observation` and `prediction` of one tick are published together, at the newest tick that all
-//! three have.
+//! The topics of a tick: `world`, `observation`, `prediction` and `neighbours` of one tick are published together, at the newest tick that
+//! all of them have. `neighbours` counts among them while a viewer subscribes to it.
 
 use std::time::Duration;
 
@@ -24,18 +24,31 @@ use crate::{
 /// How long messages of different ticks wait for one another before they are published as they are.
 const COMMON_TICK_LIMIT: Duration = Duration::from_millis(500);
 
+/// How often zenoh is asked whether a topic has a subscriber.
+const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
+
 /// The channels with a message for each tick, in the order of the data.
-const TICK_CHANNELS: [(Channel, Topic); 3] = [
+const TICK_CHANNELS: [(Channel, Topic); 4] = [
     (Channel::World, Topic::World),
     (Channel::Observation, Topic::Observation),
     (Channel::Prediction, Topic::Prediction),
+    (Channel::Neighbours, Topic::Neighbours),
 ];
+/// The place of the observation among them, whose slots the later ones have.
+const OBSERVATION: usize = 1;
 
 /// A channel with a message for each tick, and its rate.
 struct TickStream {
     topic: Topic,
     feed: ChannelFeed,
     budget: RateBudget,
+    /// It is published: always, or while a viewer subscribes.
+    is_watched: bool,
+}
+
+/// True if a topic is published while a viewer subscribes, and otherwise costs nothing.
+fn is_on_demand(topic: Topic) -> bool {
+    topic == Topic::Neighbours
 }
 
 /// The topics of a tick.
@@ -48,6 +61,8 @@ pub struct TickTopics {
     predicts_positions: bool,
     /// Since when the held messages have no tick in common.
     apart_since: Option<Duration>,
+    /// When zenoh is next asked for subscribers.
+    ask_at: Duration,
 }
 
 impl TickTopics {
@@ -57,13 +72,28 @@ impl TickTopics {
     /// A service cannot be opened.
     pub fn open(membership: &mut RunMembership) -> Result<Self, MembershipError> {
         let settings = &membership.run.config.fanout;
-        let rates_hz = [settings.world_hz, settings.observation_hz, settings.prediction_hz];
-        let streams = TICK_CHANNELS
+        let rates_hz = [
+            settings.world_hz,
+            settings.observation_hz,
+            settings.prediction_hz,
+            settings.neighbours_hz,
+        ];
+        let run = &membership.run;
+        let used: Vec<(Channel, Topic, f64)> = TICK_CHANNELS
             .into_iter()
             .zip(rates_hz)
-            .map(|((channel, topic), rate_hz)| {
-                let (feed, budget) = (ChannelFeed::open(membership, channel)?, RateBudget::new(rate_hz));
-                Ok(TickStream { topic, feed, budget })
+            .map(|((channel, topic), rate_hz)| (channel, topic, rate_hz))
+            .filter(|(channel, ..)| (channel.spec().is_used)(run))
+            .collect();
+        let streams = used
+            .into_iter()
+            .map(|(channel, topic, rate_hz)| {
+                Ok(TickStream {
+                    topic,
+                    feed: ChannelFeed::open(membership, channel)?,
+                    budget: RateBudget::new(rate_hz),
+                    is_watched: !is_on_demand(topic),
+                })
             })
             .collect::<Result<_, MembershipError>>()?;
         Ok(Self {
@@ -72,6 +102,7 @@ impl TickTopics {
             figures: TickFigures::default(),
             predicts_positions: membership.run.config.task.kind == TaskKind::Localisation,
             apart_since: None,
+            ask_at: Duration::ZERO,
         })
     }
 
@@ -95,11 +126,19 @@ impl TickTopics {
         publisher: &mut EnvironmentPublisher,
         counters: &mut FanoutCounters,
     ) -> Result<(), FanoutError> {
+        if now >= self.ask_at {
+            self.ask_at = now + MATCHING_INTERVAL;
+            self.streams
+                .iter_mut()
+                .filter(|stream| is_on_demand(stream.topic))
+                .for_each(|stream| stream.is_watched = publisher.is_watched(stream.topic));
+        }
         // Every budget is asked: asking is what refills it. A channel without a tick to publish makes nothing due: the others' newest
         // tick would be skipped, and in a paused run no other follows.
         let mut due = false;
         for stream in &mut self.streams {
-            due |= stream.budget.allows(now) && stream.feed.fresh_ticks().next().is_some();
+            let allowed = stream.budget.allows(now);
+            due |= allowed && stream.is_watched && stream.feed.fresh_ticks().next().is_some();
         }
         if !due {
             return Ok(());
@@ -133,7 +172,7 @@ impl TickTopics {
 
     /// The newest tick that every channel in use holds.
     fn common_tick(&self) -> Option<u64> {
-        let in_use = self.feeds().filter(|feed| feed.tally().ticks > 0);
+        let in_use = self.watched_feeds().filter(|feed| feed.tally().ticks > 0);
         let ticks: Vec<Vec<u64>> = in_use.map(|feed| feed.fresh_ticks().collect()).collect();
         newest_common(&ticks)
     }
@@ -156,6 +195,11 @@ impl TickTopics {
         self.streams.iter().map(|stream| &stream.feed)
     }
 
+    fn watched_feeds(&self) -> impl Iterator<Item = &ChannelFeed> {
+        let watched = self.streams.iter().filter(|stream| stream.is_watched);
+        watched.map(|stream| &stream.feed)
+    }
+
     /// Publishes the given tick of each channel that is due and holds it.
     fn publish_set(
         &mut self,
@@ -166,6 +210,7 @@ impl TickTopics {
     ) -> Result<(), FanoutError> {
         self.measure(ticks);
         let chosen = self.chosen_slots(ticks);
+        let observed = ticks.get(OBSERVATION).copied().flatten();
         // Encode what is due, and give the messages back to shared memory.
         let mut longest = 0;
         let mut encoded = Vec::new();
@@ -175,9 +220,11 @@ impl TickTopics {
                 continue;
             };
             let header = *message.header();
-            let is_due = stream.budget.allows(now) || stream.budget.joins();
+            let is_due = stream.is_watched && (stream.budget.allows(now) || stream.budget.joins());
+            let chosen = chosen.as_deref().filter(|_| observed == Some(tick));
             let framed = is_due.then(|| match stream.topic {
-                Topic::Prediction => frame::encode_prediction(&header, message.payload(), chosen.as_deref()),
+                Topic::Prediction => frame::encode_prediction(&header, message.payload(), chosen),
+                Topic::Neighbours => frame::encode_neighbours(&header, message.payload(), chosen),
                 _ => frame::encode(stream.feed.channel(), &header, message.payload()),
             });
             stream.feed.release(tick);
@@ -210,13 +257,10 @@ impl TickTopics {
         Ok(())
     }
 
-    /// The slots of the observation that its frame keeps, if it does not keep all: the prediction of the same tick has the same ones.
+    /// The slots of the observation that its frame keeps, if it does not keep all: later topics of the same tick have the same ones.
     fn chosen_slots(&self, ticks: &[Option<u64>]) -> Option<Vec<usize>> {
-        let [_, observed, predicted] = ticks else { return None };
-        if observed != predicted {
-            return None;
-        }
-        let message = self.streams.get(1)?.feed.fresh((*observed)?)?;
+        let observed = ticks.get(OBSERVATION).copied().flatten()?;
+        let message = self.streams.get(OBSERVATION)?.feed.fresh(observed)?;
         frame::chosen_slots(message.header(), message.payload()).ok().flatten()
     }
 
@@ -275,7 +319,7 @@ impl TickTopics {
     /// True if every channel in use has the newest tick and holds nothing unpublished.
     #[must_use]
     pub fn all_published(&self) -> bool {
-        let mut in_use = self.feeds().filter(|feed| feed.tally().ticks > 0);
+        let mut in_use = self.watched_feeds().filter(|feed| feed.tally().ticks > 0);
         let newest = self.feeds().map(|feed| feed.tally().ticks).max();
         in_use.all(|feed| Some(feed.tally().ticks) == newest && feed.fresh_ticks().next().is_none())
     }

@@ -22,6 +22,7 @@ use ipc_schema::{
     config::Config,
     header::{DIMENSIONS, MessageHeader},
     membership::RunMembership,
+    neighbours::{NEIGHBOUR_COLUMNS, NeighboursLayout},
     observation::ObservationLayout,
     pointcloud::{PointcloudLayout, Scan},
     ports::{Publisher, RosterWriter},
@@ -96,6 +97,11 @@ impl Run {
     }
 
     pub fn at_rate(name: &str, mode: Mode, rate_hz: f64) -> Self {
+        Self::with_settings(name, mode, rate_hz, |_| {})
+    }
+
+    /// A run whose configuration `change` has changed.
+    pub fn with_settings(name: &str, mode: Mode, rate_hz: f64, change: impl FnOnce(&mut Config)) -> Self {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("logs")).unwrap();
         let port = ReservedPort::take();
@@ -104,6 +110,8 @@ impl Run {
         settings.world_hz = rate_hz;
         settings.observation_hz = rate_hz;
         settings.prediction_hz = rate_hz;
+        settings.neighbours_hz = rate_hz;
+        change(&mut file.config);
         let path = file.write().unwrap();
         std::fs::create_dir_all(&file.shared_memory.root).unwrap();
         let node = services::node(&file.shared_memory).unwrap();
@@ -308,6 +316,31 @@ pub fn send_prediction(membership: &RunMembership, publisher: &Publisher, tick: 
     let rows = vec![[tick as f32, 0.5]; count];
     payload[..layout.prediction.len].copy_from_slice(cast_slice(&rows));
     send(publisher, header, &payload);
+}
+
+/// Objects that each slot knows in [`neighbours`].
+pub const NEAREST: usize = 3;
+
+/// What `count` slots know from messages at `tick`; with `speakers` there is what the policy of the messages task sees, too.
+pub fn neighbours(tick: u64, count: usize, speakers: usize) -> (NeighboursLayout, Vec<u8>) {
+    let layout = NeighboursLayout::sized(count, NEAREST, speakers, 8 * speakers.min(1));
+    let mut payload = vec![0xee; layout.len];
+    let objects: &mut [[f32; NEIGHBOUR_COLUMNS]] = view_mut(&mut payload, layout.objects).unwrap();
+    for (place, object) in objects.iter_mut().enumerate() {
+        *object = [tick as f32; NEIGHBOUR_COLUMNS];
+        object[0] = place as f32;
+    }
+    let vehicles: &mut [u32] = view_mut(&mut payload, layout.vehicle).unwrap();
+    vehicles
+        .iter_mut()
+        .zip(0..)
+        .for_each(|(vehicle, index)| *vehicle = index);
+    (layout, payload)
+}
+
+pub fn send_neighbours(membership: &RunMembership, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+    let (layout, payload) = neighbours(tick, count, count);
+    send(publisher, header(membership, tick, flags, layout.shape), &payload);
 }
 
 /// Sends a census: a road user for each of `ids`, by index, and a traffic light in the state of each letter.

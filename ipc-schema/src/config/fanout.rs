@@ -34,6 +34,8 @@ pub struct FanoutConfig {
     pub observation_hz: f64,
     /// The same of `prediction`.
     pub prediction_hz: f64,
+    /// The same of `neighbours`.
+    pub neighbours_hz: f64,
     /// The same of each LIDAR's `pointcloud`.
     pub pointcloud_hz: f64,
     /// The same of `event`.

@@ -509,6 +509,7 @@ pub const KEYS: &[ConfigKey] = &[
     float("fanout.world_hz", "1/s", 0.0, 1000.0, "Limit of `world` frames per wall second; 0 = none."),
     float("fanout.observation_hz", "1/s", 0.0, 1000.0, "Limit of `observation` frames per wall second; 0 = none."),
     float("fanout.prediction_hz", "1/s", 0.0, 1000.0, "Limit of `prediction` frames per wall second; 0 = none."),
+    float("fanout.neighbours_hz", "1/s", 0.0, 1000.0, "Limit of `neighbours` frames (what road users know from messages) per wall second, while a viewer subscribes to them; 0 = none."),
     float("fanout.pointcloud_hz", "1/s", 0.0, 1000.0, "Limit of frames of each LIDAR per wall second, while a viewer subscribes to it; 0 = none."),
     float("fanout.event_hz", "1/s", 0.0, 1000.0, "Limit of contact messages per wall second; 0 = none."),
     float("fanout.signals_hz", "1/s", 0.0, 1000.0, "Limit of traffic-light frames per wall second, after changes; 0 = none."),

@@ -31,6 +31,7 @@ _EXAMPLES = """Examples:
   caraware-viewer --save run.rrd                   record; open it later with `rerun run.rrd`
   caraware-viewer --web --save run.rrd             both
   caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with all LIDAR points
+  caraware-viewer --vehicle cav.3 --messages       what cav.3 knows from messages, and its links
   caraware-viewer tcp/127.0.0.1:7448 --run town-2  another endpoint, one of several runs there
 
 A run on another machine listens on its own loopback. From your laptop:
@@ -131,6 +132,11 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         type=float,
         nargs=4,
         help="show the rectangle from x, y to x, y alone (four numbers, world metres), in full detail",
+    )
+    group.add_argument(
+        "--messages",
+        action="store_true",
+        help="what the followed vehicle knows from V2X messages, its links, and which stations have just sent",
     )
     group.add_argument(
         "--lidar",

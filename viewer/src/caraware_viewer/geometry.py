@@ -78,6 +78,15 @@ def links_m(points_m: Points, vehicles_m: Points) -> NDArray[np.float32]:
     return np.stack([points_m, vehicles_m], axis=1).astype(np.float32)
 
 
+def boxes_m(centres_m: Points, yaw_rad: Points, sizes_m: Points) -> NDArray[np.float32]:
+    """Closed outlines `[n, 8, 2]` of boxes by centre `[n, 2]`, yaw `[n]`, length and width `[n, 2]`, with an arrow."""
+    along_m = (_OUTLINE[:, 0] - 0.5) * np.asarray(sizes_m)[:, :1]
+    across_m = _OUTLINE[:, 1] / 2 * np.asarray(sizes_m)[:, 1:2]
+    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    offsets_m = np.stack([cos * along_m - sin * across_m, sin * along_m + cos * across_m], axis=-1)
+    return (np.asarray(centres_m)[:, None, :] + offsets_m).astype(np.float32)
+
+
 def hatching_m(outline_m: Points, spacing_m: float) -> list[NDArray[np.float32]]:
     """Horizontal segments `[2, 2]` inside a polygon `[n, 2]` (even-odd), `spacing_m` apart.
 

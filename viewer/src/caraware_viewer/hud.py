@@ -12,6 +12,7 @@ from caraware_viewer import wire
 from caraware_viewer.detail import sampling_order
 from caraware_viewer.documents import ProcessStatus, RunMap, RunStatus, TrainingStatus
 from caraware_viewer.layout import SENSORS
+from caraware_viewer.messages import SOURCES, known_objects
 from caraware_viewer.pairing import mean_m
 from caraware_viewer.picture import Picture
 
@@ -158,8 +159,23 @@ def _vehicle(picture: Picture, id_hash: int) -> str:
         ("heading", f"{math.degrees(compass_rad):.1f}° {compass_letters(compass_rad)}"),
         ("acceleration", _vector(accel, "m/s²")),
         ("rates", _vector(np.degrees(rate), "°/s")),
+        *_radio(picture, int(row["vehicle"])),
     ]
     return f"#### {_escaped(picture.name(id_hash))} ({source})\n" + _table(rows[0], rows[1:])
+
+
+def _radio(picture: Picture, vehicle: int) -> list[tuple[str, str]]:
+    """What a vehicle's radio did in the tick before, and how it knows others, if messages are shown."""
+    neighbours = picture.neighbours
+    slot = None if neighbours is None else neighbours.slot_of(vehicle)
+    if neighbours is None or slot is None:
+        return []
+    _, known, sent, sent_bytes, received = (int(number) for number in neighbours.radio[slot])
+    busy = f"channel {100 * float(neighbours.channel_load[slot]):.0f} % busy"
+    counts = np.bincount(neighbours.source[slot, known_objects(neighbours, slot)], minlength=len(SOURCES))
+    listed = [f"{name} {count}" for name, count in zip(SOURCES[1:], counts[1:], strict=False) if count]
+    radio = f"{sent} sent ({sent_bytes} B) · {received} received · {busy}"
+    return [("radio", radio), ("knows", " · ".join([f"{known} objects", *listed]))]
 
 
 def compass_letters(compass_rad: float) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from caraware_viewer import messages as of_messages
 from caraware_viewer import top
 from caraware_viewer.canvas import Canvas
 
@@ -26,6 +27,14 @@ _ROWS: tuple[tuple[tuple[str, int], ...], ...] = (
         ("contact", top.rgba(top.CONTACT_COLOR)),
     ),
 )
+_MESSAGE_ROW: tuple[tuple[str, int], ...] = (
+    *(
+        (f"known by {name}", int(color))
+        for name, color in zip(of_messages.SOURCES[1:4], of_messages.SOURCE_COLORS[1:4], strict=True)
+    ),
+    ("link, sender", top.rgba(of_messages.SENDER_COLOR)),
+)
+"""What `--messages` adds."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +48,13 @@ class LegendSize:
 LEGEND = LegendSize(width=100.0, height=13.0)
 
 
-def draw_legend(canvas: Canvas) -> None:
-    """Draws the legend once."""
+def draw_legend(canvas: Canvas, *, messages: bool = False) -> None:
+    """Draws the legend once; with `messages` it has a row for what is known from them."""
+    rows = (*_ROWS, _MESSAGE_ROW) if messages else _ROWS
     places, names, colors = [], [], []
-    for row, signs in enumerate(_ROWS):
+    for row, signs in enumerate(rows):
         for column, (name, color) in enumerate(signs):
-            places.append((LEGEND.width * (column + 0.5) / len(signs), LEGEND.height * (row + 0.25) / len(_ROWS)))
+            places.append((LEGEND.width * (column + 0.5) / len(signs), LEGEND.height * (row + 0.25) / len(rows)))
             names.append(name)
             colors.append(color)
     points = rr.Points2D(

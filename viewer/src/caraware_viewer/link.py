@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
@@ -19,10 +19,12 @@ import zenoh
 from caraware_viewer import access
 from caraware_viewer.documents import RunMap
 from caraware_viewer.layout import SCHEMA_VERSION
-from caraware_viewer.sets import TICK_TOPICS, TickSets
+from caraware_viewer.sets import EVERY_RUNS_TOPICS, TICK_TOPICS, TickSets
 from caraware_viewer.wire import FrameError, decode_header
 
 TOPICS = (*TICK_TOPICS, "status", "learning", "vehicles", "signals", "routes", "event")
+MESSAGES = "neighbours"
+"""The topic of what is known from messages, which the fan-out sends while a viewer subscribes."""
 WHOLE_COURSE = "learning/whole"
 """Name under which the answer to a query for `learning` is stored."""
 CLOUD_PREFIX = "pointcloud/"
@@ -90,12 +92,14 @@ class Sample:
 class LatestFrames:
     """The newest sample of each topic, until it is taken; counts the samples that were replaced and that were lost.
 
-    Of `world`, `observation` and `prediction` it has the samples of the newest tick that arrived on all of them.
+    Of `world`, `observation`, `prediction` and `neighbours` it has the samples of the newest tick that arrived on all
+    of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, topics: Collection[str] = EVERY_RUNS_TOPICS) -> None:
+        """`topics` are those of a tick that are subscribed to."""
         self._frames: dict[str, Sample] = {}
-        self._sets: TickSets[Sample] = TickSets()
+        self._sets: TickSets[Sample] = TickSets(topics=topics)
         self._changed = threading.Condition()
         self._closed = False
         self.ended = False
@@ -210,13 +214,15 @@ def find_run(
 class RunLink:
     """The subscriptions to a run. Use as a context manager."""
 
-    def __init__(self, session: zenoh.Session, run: RunKey) -> None:
+    def __init__(self, session: zenoh.Session, run: RunKey, *, messages: bool = False) -> None:
+        """`messages` subscribes to what road users know from messages, too."""
         self.run = run
-        self.frames = LatestFrames()
+        self._topics = tuple(topic for topic in TOPICS if messages or topic != MESSAGES)
+        self.frames = LatestFrames([topic for topic in TICK_TOPICS if topic in self._topics])
         self._session = session
         self._end_timer: threading.Timer | None = None
         # A subscriber ends when it is garbage-collected, so they are kept here.
-        self._subscribers = [self._subscribe(topic) for topic in TOPICS]
+        self._subscribers = [self._subscribe(topic) for topic in self._topics]
         self._clouds: dict[str, zenoh.Subscriber[None]] = {}
         # zenoh reports the end of a killed peer's token only to clients that have seen the token: hence the history.
         self._tokens = session.liveliness().declare_subscriber(f"{run.prefix}/alive", self._on_token, history=True)
@@ -258,7 +264,7 @@ class RunLink:
             if reply.ok is None:
                 continue
             topic = str(reply.ok.key_expr).removeprefix(f"{self.run.prefix}/")
-            if topic in TOPICS:
+            if topic in self._topics:
                 # Samples of this topic have the newest points only, the answer has all.
                 self.frames.add(WHOLE_COURSE if topic == "learning" else topic, Sample.of(reply.ok))
 

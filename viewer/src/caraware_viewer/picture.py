@@ -18,9 +18,11 @@ class Picture:
     """The newest state of a run; any part may be missing."""
 
     wanted: Sequence[str] = ()
-    """SUMO ids of the vehicles to follow; empty: a hero, else a vehicle with a LIDAR, else the first with sensors."""
+    """SUMO ids of the vehicles to follow; empty: a hero, else a vehicle with a LIDAR, else the first with sensors.
+    Where messages are shown, it is one with a radio."""
     world: wire.World | None = None
     observation: wire.Observation | None = None
+    neighbours: wire.Neighbours | None = None
     distances: Distances | None = None
     """Of the newest tick that has an observation and, if there is a policy, its prediction."""
     names: dict[int, str] = field(default_factory=dict)
@@ -39,6 +41,13 @@ class Picture:
     _last_default: int | None = None
     _routes_of: int | None = None
     _names_of: tuple[int, int] | None = None
+
+    def enter_neighbours(self, frame: wire.Neighbours) -> None:
+        """Enters what road users know from messages. A vehicle without a radio is no longer followed by default."""
+        self.neighbours = frame
+        row = None if self._last_default is None else self.row(self._last_default)
+        if row is not None and frame.slot_of(int(row["vehicle"])) is None:
+            self._last_default = None
 
     def enter_names(self, frame: wire.Table) -> None:
         """Enters rows of the table of road users; a new episode empties it."""
@@ -93,7 +102,7 @@ class Picture:
         heroes = states["id_hash"][states["kind"] == wire.HERO]
         if len(heroes):
             return int(heroes[0])
-        present = set(states["id_hash"].tolist())
+        present = set(self._with_radio(states)["id_hash"].tolist())
         if self.observation is not None:
             valid = self.observation.valid
             for chosen in (valid & (self.observation.sensors & wire.sensor_bit("lidar") != 0), valid):
@@ -101,8 +110,16 @@ class Picture:
                 if sensing:
                     return sensing[0]
             return None
+        states = self._with_radio(states)
         cavs = states["id_hash"][states["kind"] == wire.CAV]
         return int(cavs[0]) if len(cavs) else None
+
+    def _with_radio(self, states: NDArray[np.void]) -> NDArray[np.void]:
+        """Those of the road users that have a radio, if messages are shown and any has."""
+        if self.neighbours is None:
+            return states
+        found = states[np.isin(states["vehicle"], self.neighbours.vehicle[self.neighbours.radio[:, 0] != 0])]
+        return found if len(found) else states
 
     def row(self, id_hash: int) -> np.void | None:
         """State of a road user; `None` if it is not on the road."""

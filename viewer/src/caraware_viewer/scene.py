@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from caraware_viewer import cloud, detail, geometry, memory, plots, space, top, wire
+from caraware_viewer import cloud, detail, geometry, memory, messages, plots, space, top, wire
 from caraware_viewer.canvas import Canvas
 from caraware_viewer.course import Course
 from caraware_viewer.detail import Detail, Region
@@ -93,8 +93,12 @@ class Scene:
         *,
         live: rr.RecordingStream | None = None,
         region: Region | None = None,
+        messages: bool = False,
     ) -> None:
-        """`recording` keeps the history of the run, and `live` shows its present; either may be missing."""
+        """`recording` keeps the history of the run, and `live` shows its present; either may be missing.
+
+        With `messages` the legend names what is drawn of frames of `neighbours`.
+        """
         try:
             self._canvas = Canvas(recording, float(run_map["tick_s"]), live)
             x_min, y_min, x_max, y_max = (float(value) for value in run_map["map"]["bounds_m"])
@@ -127,7 +131,7 @@ class Scene:
         """Frames that were not drawn because newer ones had arrived, as the link counts them."""
         self._stop_lines = _stop_lines(run_map)
         self._paint = draw_map(self._canvas, run_map)
-        draw_legend(self._canvas)
+        draw_legend(self._canvas, messages=messages)
         plots.name_series(self._canvas)
         self.server_mib = SERVER_MEMORY_MIB + _MAPS_KEPT * self._canvas.live_bytes / 2**20
         """What rerun's server has to keep, so that a new browser finds the map in it."""
@@ -155,6 +159,8 @@ class Scene:
                 self._draw_observation(wire.decode_observation(sample.payload))
             case "prediction":
                 self._draw_pair(self._pairing.prediction(wire.decode_prediction(sample.payload)))
+            case "neighbours":
+                self._draw_neighbours(wire.decode_neighbours(sample.payload))
             case "vehicles":
                 self._picture.enter_names(wire.decode_table(sample.payload, wire.VEHICLE_META))
             case "signals":
@@ -174,6 +180,11 @@ class Scene:
     def summary(self) -> str:
         """What was drawn, how fast, how old, and in how much memory; empty if nothing was drawn."""
         return self._tally.text()
+
+    @property
+    def followed(self) -> list[int]:
+        """Hashes of the ids of the followed vehicles that are on the road, the main one first."""
+        return self._picture.followed()
 
     @property
     def driving(self) -> bool:
@@ -261,6 +272,14 @@ class Scene:
             )
         self._picture.distances = distances(observation, prediction, has_positions=has_positions)
         plots.plot_errors(self._canvas, self._picture.distances)
+
+    def _draw_neighbours(self, neighbours: wire.Neighbours) -> None:
+        self._picture.enter_neighbours(neighbours)
+        if self._picture.world is None:
+            return
+        self._set_tick(neighbours.header)
+        rows = [row for row in map(self._picture.row, self._picture.followed()) if row is not None]
+        messages.draw_messages(self._canvas, neighbours, self._picture.world.states, rows[0] if rows else None)
 
     def _draw_signals(self, frame: wire.Table) -> None:
         for row in frame.rows:

@@ -1,19 +1,21 @@
 """Puts the frames of one tick together, so that a vehicle is never drawn at one tick and its fix at another.
 
-`world`, `observation` and `prediction` of a tick are published together, but on topics of different priority, and a
-slow display skips frames: each topic's newest frame may be of another tick.
+`world`, `observation`, `prediction` and `neighbours` of a tick are published together, but on topics of different
+priority, and a slow display skips frames: each topic's newest frame may be of another tick.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-TICK_TOPICS = ("world", "observation", "prediction")
+TICK_TOPICS = ("world", "observation", "prediction", "neighbours")
 """The topics of a tick, in the order in which they are drawn."""
+EVERY_RUNS_TOPICS = ("world", "observation", "prediction")
+"""Those that a viewer always subscribes to."""
 
 _PATIENCE_S = 0.2
 """Longest wait for the topics of a tick that are missing: one is switched off, has a lower rate, or was lost."""
@@ -34,8 +36,11 @@ class _Set(Generic[Frame]):
 class TickSets(Generic[Frame]):
     """Collects frames by tick, and returns the newest tick of which every usual topic is there."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, topics: Collection[str] = EVERY_RUNS_TOPICS
+    ) -> None:
+        """`topics` are waited for at first; later those that came with the newest sets."""
+        self._clock, self._at_first = clock, frozenset(topics)
         self._sets: dict[Tick, _Set[Frame]] = {}
         self._taken: Tick | None = None
         self._usual: deque[frozenset[str]] = deque(maxlen=_REMEMBERED_SETS)
@@ -73,7 +78,7 @@ class TickSets(Generic[Frame]):
         return {topic: found.frames[topic] for topic in TICK_TOPICS if topic in found.frames}
 
     def _newest_ready(self) -> Tick | None:
-        usual = frozenset().union(*self._usual) if self._usual else frozenset(TICK_TOPICS)
+        usual = frozenset().union(*self._usual) if self._usual else self._at_first
         now_s = self._clock()
         for tick in reversed(self._sets):
             found = self._sets[tick]

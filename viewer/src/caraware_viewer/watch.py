@@ -38,10 +38,18 @@ def watch_run(options: argparse.Namespace) -> int:
     except BaseException:
         session.close()
         raise
-    with RunLink(session, run) as link:
+    with RunLink(session, run, messages=options.messages) as link:
         run_map = link.map(options.timeout)
         kept, live = _recordings(options, f"{run.run}/{run.env}")
-        scene = Scene(kept, run_map, options.vehicle, options.lidar, live=live, region=options.region)
+        scene = Scene(
+            kept,
+            run_map,
+            options.vehicle,
+            options.lidar,
+            live=live,
+            region=options.region,
+            messages=options.messages,
+        )
         with _open_display(options, scene.server_mib) as display:
             _connect(live, options, display)
             scene.display_pid = None if display is None else display.pid

@@ -132,6 +132,44 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class Neighbours:
+    """What every connected road user knows of others from messages, one row for each slot of the observation."""
+
+    header: Header
+    objects: NDArray[np.float32]
+    """`[n, k, 11]`: known objects, the nearest first: x, y (metres, world frame, centre) and velocity x, y (m/s) when
+    they were measured, heading (radians), length, width (metres), age of the measurement (seconds), then standard
+    deviations: of the position on each axis (metres), of the velocity on each axis (m/s), of the heading (radians)."""
+    ids: NDArray[np.uint32]
+    """`[n, k, 3]`: station of the object (0: it has no name), station that it was heard from, `NeighbourSource`."""
+    radio: NDArray[np.uint32]
+    """`[n, 5]`: 1 with a radio, objects known; in the tick before: messages sent, bytes of them, messages received."""
+    channel_load: NDArray[np.float32]
+    """`[n]`: share of the tick before in which the radio found the channel busy."""
+    vehicle: NDArray[np.uint32]
+
+    @property
+    def source(self) -> NDArray[np.uint32]:
+        """`[n, k]`: the message that an object is known from; 0 where there is no object."""
+        source: NDArray[np.uint32] = self.ids[:, :, 2]
+        return source
+
+    @property
+    def sent(self) -> NDArray[np.uint32]:
+        """`[n]`: messages sent in the tick before."""
+        sent: NDArray[np.uint32] = self.radio[:, 2]
+        return sent
+
+    def slot_of(self, vehicle: int) -> int | None:
+        """Slot of a vehicle by its index; `None` if it has none, or no radio."""
+        found = np.flatnonzero((self.vehicle == vehicle) & (self.radio[:, 0] != 0))
+        return int(found[0]) if len(found) else None
+
+
+_KNOWN = tuple(name for name in Neighbours.__dataclass_fields__ if name != "header")
+
+
+@dataclass(frozen=True)
 class Table:
     """A frame of `VEHICLE_META`, `SIGNAL_META`, `ROUTE_POINT` or `COLLISION` rows."""
 
@@ -191,6 +229,13 @@ def decode_prediction(frame: bytes) -> Prediction:
     _, _, estimated_slots, *_ = header.shape
     sections = _sections(frame, "prediction", header)
     return Prediction(header, sections["prediction"], sections["estimate_m"] if estimated_slots else None)
+
+
+def decode_neighbours(frame: bytes) -> Neighbours:
+    """A `neighbours` frame."""
+    header = decode_header(frame)
+    sections = _sections(frame, "neighbours", header)
+    return Neighbours(header, **{name: sections[name] for name in _KNOWN})
 
 
 def decode_cloud(frame: bytes) -> PointCloud:
