@@ -442,8 +442,7 @@ def test_random_bytes_are_refused_on_every_topic(drawn: Drawn) -> None:
     recording = rr.RecordingStream("test", recording_id="garbage")
     drawing = Scene(recording, cast(RunMap, MAP))
     topics = ("world", "observation", "prediction", "status", "learning", "vehicles", "signals", "routes", "event")
-    topics = (*topics, "neighbours")
-    for topic in (*topics, "pointcloud/a"):
+    for topic in (*topics, "neighbours", "pointcloud/a"):
         for size in (0, 1, 95, 96, 500, 4000):
             with pytest.raises(wire.FrameError):
                 drawing.draw(topic, Sample(random.bytes(size)))
