@@ -24,11 +24,12 @@ use recorder::file::{
     RecordingError,
     reader::{ChannelMessage, RecordingReader},
 };
-use sensor_daemon::delivery::tick_publisher::TickPublisher;
 use serde_json::json;
 
 mod census;
+mod outputs;
 use census::PlayedCensus;
+use outputs::{TickMessage, TickOutputs};
 
 /// Longest wait between two looks at the clock and the request to stop.
 const LOOK: Duration = Duration::from_millis(50);
@@ -60,7 +61,7 @@ struct Player {
     membership: RunMembership,
     /// By [`Channel`]; `None` for those that the replay does not send.
     publishers: Vec<Option<Publisher>>,
-    observations: TickPublisher,
+    outputs: TickOutputs,
     census: PlayedCensus,
     from_tick: u64,
     /// Tick that the clock began with, and when.
@@ -78,9 +79,9 @@ impl Player {
         let has_trainer = membership.run.mode.has_trainer();
         let is_sent = |channel: Channel| match channel {
             // Their only receivers are simulators.
-            Channel::Traffic | Channel::EgoPose | Channel::Switch | Channel::Measurement | Channel::Neighbours => false,
-            // It has a publisher of its own.
-            Channel::Observation => false,
+            Channel::Traffic | Channel::EgoPose | Channel::Switch | Channel::Measurement => false,
+            // They have publishers of their own.
+            Channel::Observation | Channel::Neighbours => false,
             Channel::Prediction => !has_trainer,
             Channel::Pointcloud => membership.run.config.carries(SensorKind::Lidar),
             Channel::Image => membership.run.config.carries(SensorKind::Camera),
@@ -91,11 +92,11 @@ impl Player {
         };
         let publisher = |channel: Channel| is_sent(channel).then(|| membership.publisher(channel)).transpose();
         let publishers = Channel::ALL.into_iter().map(publisher).collect::<Result<_, _>>()?;
-        let observations = TickPublisher::open(&membership, Channel::Observation)?;
+        let outputs = TickOutputs::open(&membership)?;
         membership.attach();
         Ok(Self {
             publishers,
-            observations,
+            outputs,
             census: PlayedCensus::default(),
             from_tick: replay.from_tick,
             begun: None,
@@ -139,8 +140,8 @@ impl Player {
         if self.wait_until_due(header.tick)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
-        if message.channel == Channel::Observation {
-            return self.play_observation(header, message.payload());
+        if matches!(message.channel, Channel::Observation | Channel::Neighbours) {
+            return self.play_tick(message.channel, header, message.payload());
         }
         if message.channel == Channel::World
             && let Some(census) = &self.publishers[Channel::Census as usize]
@@ -177,20 +178,19 @@ impl Player {
         })
     }
 
-    /// Sends an observation to viewers, and to the trainer as `sensor-daemon` does.
-    fn play_observation(&mut self, header: MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
-        let waited = self
-            .observations
-            .wait_for_credit(&mut self.membership, header.tick, payload.len())?;
-        if waited == Wait::Stopped {
+    /// Sends an observation, or what is known from messages, to viewers, and to the trainer as the simulators do.
+    fn play_tick(&mut self, channel: Channel, header: MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
+        let message = TickMessage {
+            header,
+            payload: payload.to_vec(),
+        };
+        let Some(sent) = self.outputs.take(&mut self.membership, channel, message)? else {
             return Ok(Wait::Stopped);
+        };
+        for TickMessage { header, payload } in sent {
+            self.digest.add(&header, &payload);
+            self.report(&header, &payload);
         }
-        self.digest.add(&header, payload);
-        let header = self.observations.addressed(header);
-        let mut draft = self.observations.port().loan_unwritten(header, payload.len())?;
-        draft.payload_mut().copy_from_slice(payload);
-        self.observations.publish(&header, draft)?;
-        self.report(&header, payload);
         Ok(Wait::Ready)
     }
 
@@ -215,7 +215,7 @@ impl Player {
 
     /// Leaves once the trainer is done.
     fn leave(mut self, replay: &Replay) -> Result<(), Failure> {
-        if self.observations.has_trainer() && !self.has_last {
+        if self.outputs.observations.has_trainer() && !self.has_last {
             let file = replay.file.display();
             return Err(Failure::new(
                 FailureKind::Run,
@@ -226,9 +226,7 @@ impl Player {
             )
             .with_help("learn from the recording of a run that was completed"));
         }
-        let waited = self
-            .observations
-            .wait_for_consumers_end(&mut self.membership, self.ticks, || true)?;
+        let waited = self.outputs.wait_for_consumers_end(&mut self.membership, self.ticks)?;
         self.write_part()?;
         if waited == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);
@@ -238,7 +236,7 @@ impl Player {
 
     fn write_part(&self) -> Result<(), Failure> {
         let first_tick = self.first_tick.unwrap_or(0);
-        let delivery = self.observations.figures();
+        let delivery = self.outputs.observations.figures();
         self.membership.write_part(&json!({
             "observation_hash": self.digest.hex(),
             "first_tick": first_tick,

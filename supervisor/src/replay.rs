@@ -2,6 +2,7 @@
 
 use ipc_schema::{
     SCHEMA_VERSION,
+    channel::Channel,
     run::{Mode, Replay, RunFile},
     storage,
 };
@@ -41,10 +42,13 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
     }
     set.extend(args.set.iter().cloned());
     let mut config = LayeredSettings::of(&old.config)?.with_assignments(&set)?.validate()?;
-    if args.learn && config.v2x.is_on() {
+    if args.learn && config.v2x.is_on() && !holds(&recording, Channel::Neighbours) {
         return Err(Exit::config(
-            "a trainer of a run with messages (`v2x.share`) needs the channel `neighbours`, which a replay does not send yet",
-            "replay it without --learn, or train on a new run",
+            format!(
+                "{} has no channel `neighbours`, which a trainer of a run with messages (`v2x.share`) needs",
+                recording.path().display()
+            ),
+            "replay it without --learn, or record a run whose `record.channels` lists it",
         ));
     }
     system_limits::check_open_files(config.run.envs)?;
@@ -103,6 +107,12 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
         quiet: args.quiet,
         viewer,
     })
+}
+
+/// True if the recording has a message of a channel; what is damaged is reported when it is played.
+fn holds(recording: &RecordingReader, channel: Channel) -> bool {
+    let mut readable = recording.channel_messages().map_while(Result::ok);
+    readable.any(|message| message.channel == channel)
 }
 
 /// The run file of the recorded run.

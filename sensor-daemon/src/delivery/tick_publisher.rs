@@ -42,6 +42,8 @@ pub struct TickPublisher {
     shows_committed: bool,
     /// The oldest tick of the journal, as the board has it.
     journal_first: u64,
+    /// The board has the oldest tick of this journal.
+    is_on_board: bool,
 }
 
 impl TickPublisher {
@@ -63,6 +65,18 @@ impl TickPublisher {
             committed_ticks: membership.run.committed_ticks(),
             shows_committed: membership.run.restart.is_some() && membership.run.config.drives(),
             journal_first: 0,
+            is_on_board: true,
+        })
+    }
+
+    /// Opens a further channel of a process that has one already: the process's board has the journal of that one.
+    ///
+    /// # Errors
+    /// As [`TickPublisher::open`].
+    pub fn open_further(membership: &RunMembership, channel: Channel) -> Result<Self, Failure> {
+        Ok(Self {
+            is_on_board: false,
+            ..Self::open(membership, channel)?
         })
     }
 
@@ -133,13 +147,28 @@ impl TickPublisher {
             return Ok(Wait::Ready);
         }
         let since = Instant::now();
-        let waited = self.wait_until(membership, |port| {
-            port.trainer_takes(len) && port.others.have_credit(tick)
-        })?;
+        let waited = self.wait_until(membership, |port| port.takes(tick, len))?;
+        self.waited_since(since);
+        Ok(waited)
+    }
+
+    /// True if a message of `len` bytes for `tick` may be published, as [`TickPublisher::wait_for_credit`] waits for.
+    #[must_use]
+    pub fn takes(&self, tick: u64, len: usize) -> bool {
+        tick < self.committed_ticks || self.trainer_takes(len) && self.others.have_credit(tick)
+    }
+
+    /// Notes a wait for credit that is over, for the figures of handovers.
+    pub fn waited_since(&mut self, since: Instant) {
         if let Some(trainer) = &mut self.trainer {
             trainer.update_handover(since);
         }
-        Ok(waited)
+    }
+
+    /// True once the trainer is done and the others have consumed all ticks below `ticks`.
+    #[must_use]
+    pub fn has_ended(&self, ticks: u64) -> bool {
+        self.trainer.as_ref().is_none_or(Delivery::is_done) && self.others.have_consumed(ticks)
     }
 
     /// Keeps the message for the trainer, and sends it. If the trainer has no credit for it, the journal sends it later. A tick of the
@@ -171,9 +200,7 @@ impl TickPublisher {
         ticks: u64,
         condition: impl Fn() -> bool,
     ) -> Result<Wait, Failure> {
-        self.wait_until(membership, |port| {
-            port.trainer.as_ref().is_none_or(Delivery::is_done) && port.others.have_consumed(ticks) && condition()
-        })
+        self.wait_until(membership, |port| port.has_ended(ticks) && condition())
     }
 
     /// True if a trainer receives the channel.
@@ -194,18 +221,24 @@ impl TickPublisher {
         }
     }
 
-    fn is_trainer_behind(&self) -> bool {
+    /// True if a successor of the trainer lacks ticks that it may have: [`TickPublisher::catch_up`] sends them.
+    #[must_use]
+    pub fn is_trainer_behind(&self) -> bool {
         let trainer = self.trainer.as_ref();
         trainer.is_some_and(|trainer| trainer.is_behind(&self.others))
     }
 
-    fn catch_up(&mut self, membership: &mut RunMembership) -> Result<(), Failure> {
+    /// Sends a successor of the trainer what it lacks and may have.
+    ///
+    /// # Errors
+    /// As [`TickPublisher::next`].
+    pub fn catch_up(&mut self, membership: &mut RunMembership) -> Result<(), Failure> {
         let Some(trainer) = &mut self.trainer else {
             return Ok(());
         };
         trainer.catch_up(&self.publisher, &self.others)?;
         let journal_first = trainer.journal_first();
-        if journal_first != self.journal_first {
+        if self.is_on_board && journal_first != self.journal_first {
             // The board has the number of ticks that the journal does not hold any more: a trainer reads there whether it can continue.
             membership.committed(journal_first);
             self.journal_first = journal_first;

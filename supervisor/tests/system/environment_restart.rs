@@ -10,7 +10,7 @@ use crate::common::{CURRICULUM, Spectator, Workplace, sumo_program, text, tool, 
 use ipc_schema::process::Process;
 use rustix::process::{Pid, Signal, kill_process};
 
-const SIMULATORS: [&str; 3] = ["traffic-bridge", "sim-core", "sensor-daemon"];
+const SIMULATORS: [&str; 4] = ["traffic-bridge", "sim-core", "sensor-daemon", "v2x"];
 
 /// A few vehicles, four episodes with an evaluation between. Small networks, and no estimates that only viewers see.
 const SMALL: [&str; 16] = [
@@ -145,12 +145,18 @@ fn without_drops(value: &serde_json::Value) -> serde_json::Value {
 #[test]
 fn killed_simulators_of_two_environments_change_nothing_that_is_observed_or_learnt() {
     let workplace = Workplace::new();
-    let two = "run.envs=2";
-    workplace.succeed(&arguments(&["train", "town", "--name", "whole"], &SMALL, &[two]));
+    let [two, radios] = ["run.envs=2", "v2x.share=0.7"];
+    workplace.succeed(&arguments(
+        &["train", "town", "--name", "whole"],
+        &SMALL,
+        &[two, radios],
+    ));
     let paced = "run.real_time_factor=8";
-    let disturbed = arguments(&["train", "town", "--name", "killed"], &SMALL, &[two, paced]);
+    let disturbed = arguments(&["train", "town", "--name", "killed"], &SMALL, &[two, radios, paced]);
     killed_run(&workplace, &disturbed, "killed", 8);
     assert_same(&workplace, ["whole", "killed"]);
+    let [whole, killed] = ["whole", "killed"].map(|name| workplace.report(name)["v2x"]["neighbours_hash"].clone());
+    assert!(whole.is_string() && whole == killed, "{whole} {killed}");
     assert_eq!(parameters(&workplace, "whole"), parameters(&workplace, "killed"));
 }
 

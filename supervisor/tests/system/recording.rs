@@ -170,6 +170,89 @@ fn learning_from_a_lossless_recording_gives_the_parameters_of_the_run() {
     assert!(text(&other).contains("tick 0 "), "{}", text(&other));
 }
 
+/// What stations knew is recorded with the observations, and a trainer gets both, also the successor of one that dies.
+#[test]
+fn learning_what_to_say_from_a_recording_gives_the_parameters_of_the_run() {
+    let workplace = Workplace::new();
+    let small = [
+        "traffic.cavs=5",
+        "traffic.others=3",
+        "traffic.pedestrians=2",
+        "episode.ticks=110",
+        "episode.training_episodes=6",
+        "episode.evaluation_interval=2",
+        "episode.evaluation_ticks=40",
+        "episode.final_evaluations=1",
+        "trainer.horizon=300",
+        "trainer.batch_size=150",
+        "trainer.hidden=[16]",
+        "trainer.checkpoint_interval=2",
+        "trainer.matmul_precision=float32",
+        "trainer.plots=false",
+        "fanout.enabled=false",
+    ];
+    let settings = small.iter().flat_map(|setting| ["--set", *setting]);
+    let train = ["train", "messages", "--name", "live", "--record"].into_iter();
+    workplace.succeed(&train.chain(settings).collect::<Vec<_>>());
+    let live = workplace.report("live");
+    let file = run_dir(&workplace, "live").join("recording.mcap");
+    let recording = RecordingReader::open(&file).unwrap();
+    assert_eq!(
+        ticks(&recording, Channel::Neighbours),
+        ticks(&recording, Channel::Observation)
+    );
+
+    let arguments = ["replay", "live", "--learn", "--speed", "10", "--name", "again"];
+    let mut replay = spawn(&workplace, &arguments);
+    let spectator = Spectator::join_after(
+        &run_dir(&workplace, "again").join("run.json"),
+        &mut replay,
+        Process::SensorDaemon,
+    );
+    let trainer = spectator.board(Process::Trainer);
+    until(&mut replay, "ticks after a commit", || {
+        let progress = trainer.progress();
+        (progress.committed_ticks > 0 && progress.consumed_ticks > progress.committed_ticks + 5).then_some(())
+    });
+    kill_process(Pid::from_raw(trainer.health().pid).unwrap(), Signal::KILL).unwrap();
+    drop((trainer, spectator));
+    let output = replay.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let again = workplace.report("again");
+    assert_eq!(
+        (&again["observation_hash"], &again["restarts"]),
+        (&live["observation_hash"], &1.into()),
+        "{again:#}"
+    );
+    assert_eq!(
+        (&again["lost_ticks"], &again["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert_eq!(
+        learnt(&run_dir(&workplace, "again")),
+        learnt(&run_dir(&workplace, "live"))
+    );
+    workplace.assert_nothing_left();
+
+    // Without what stations knew there is nothing to learn from.
+    let settings = small.iter().flat_map(|setting| ["--set", *setting]);
+    let bare = [
+        "simulate",
+        "messages",
+        "--name",
+        "bare",
+        "--record",
+        "--set",
+        "record.channels=[\"observation\"]",
+        "--set",
+        "v2x.inclusion=standard",
+    ];
+    workplace.succeed(&bare.into_iter().chain(settings).collect::<Vec<_>>());
+    let refused = workplace.run(&["replay", "bare", "--learn"]);
+    assert_eq!(refused.status.code(), Some(2), "{}", text(&refused));
+    assert!(text(&refused).contains("`neighbours`"), "{}", text(&refused));
+}
+
 /// Kills the recorder of a run once it has written a chunk, and returns the run's exit code and what it said.
 fn kill_recorder(workplace: &Workplace, name: &str, on_death: &str) -> (Option<i32>, String) {
     let on_death = format!("record.on_death={on_death}");

@@ -159,8 +159,9 @@ def _vehicle(picture: Picture, id_hash: int) -> str:
         ("heading", f"{math.degrees(compass_rad):.1f}° {compass_letters(compass_rad)}"),
         ("acceleration", _vector(accel, "m/s²")),
         ("rates", _vector(np.degrees(rate), "°/s")),
-        *_radio(picture, int(row["vehicle"])),
     ]
+    # First: they were asked for.
+    rows = [*_radio(picture, int(row["vehicle"])), *rows]
     return f"#### {_escaped(picture.name(id_hash))} ({source})\n" + _table(rows[0], rows[1:])
 
 
