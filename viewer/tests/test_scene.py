@@ -338,7 +338,7 @@ def test_the_map_of_the_followed_vehicle_and_its_links_are_drawn(drawn: Drawn) -
     np.testing.assert_allclose(rings.mean(axis=1), [[middle[0] + 10, -50]], atol=0.1)
     text = found["hud"].newest("TextDocument:text")[0]
     assert "| radio | 0 sent (0 B) · 2 received · channel 25 % busy |" in text
-    assert "| knows | 3 objects · CAM 2 · CPM 1 |" in text
+    assert "| knows | 3 views of objects · CAM 2 · CPM 1 |" in text
     assert "known by CPM" in found[legend.SIGNS].newest("Points2D:labels")
     assert scene.refused == 0
 

@@ -176,7 +176,8 @@ def _radio(picture: Picture, vehicle: int) -> list[tuple[str, str]]:
     counts = np.bincount(neighbours.source[slot, known_objects(neighbours, slot)], minlength=len(SOURCES))
     listed = [f"{name} {count}" for name, count in zip(SOURCES[1:], counts[1:], strict=False) if count]
     radio = f"{sent} sent ({sent_bytes} B) · {received} received · {busy}"
-    return [("radio", radio), ("knows", " · ".join([f"{known} objects", *listed]))]
+    # Each station's view of an object is one; what is sent and drawn is the nearest objects.
+    return [("radio", radio), ("knows", " · ".join([f"{known} views of objects", *listed]))]
 
 
 def compass_letters(compass_rad: float) -> str:
