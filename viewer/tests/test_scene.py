@@ -357,6 +357,27 @@ def test_a_vehicle_with_a_radio_is_followed_where_messages_are_shown(drawn: Draw
     assert scene.followed == [100]
 
 
+def test_links_and_map_go_with_the_vehicle_that_is_followed(drawn: Drawn) -> None:
+    world = frames.world(4, vehicle=np.arange(3), kind=wire.CAV)
+    names = frames.vehicles(4, {100: "a"})
+    samples = [("vehicles", names), ("world", world), ("neighbours", frames.neighbours(4, KNOWN, radio=RADIO))]
+    _, found = drawn(*samples, wanted=["a"], messages=True)
+    assert len(found[messages.LINKS].newest("LineStrips2D:strips")) == 2
+    # It leaves, and no vehicle has a slot any more.
+    gone = [("world", frames.world(5, 0)), ("neighbours", frames.neighbours(5, {}))]
+    scene, found = drawn(*samples, *gone, wanted=["a"], messages=True)
+    assert scene.followed == []
+    for path in (messages.LINKS, messages.KNOWN, messages.SENDERS):
+        assert not found[path].newest("LineStrips2D:strips"), path
+
+
+def test_a_radio_of_the_last_episode_is_no_vehicles_of_the_next(drawn: Drawn) -> None:
+    world = [frames.world(tick, vehicle=np.arange(3), kind=wire.CAV) for tick in (4, 5)]
+    later = frames.header(5, 3, episode=1) + world[1][wire.HEADER.itemsize :]
+    _, found = drawn(("world", world[0]), ("neighbours", frames.neighbours(4, KNOWN, radio=RADIO)), ("world", later))
+    assert "| radio |" not in found["hud"].newest("TextDocument:text")[0]
+
+
 def test_without_messages_the_legend_does_not_name_them(drawn: Drawn) -> None:
     _, found = drawn(("world", frames.world(4)))
     assert "known by CPM" not in found[legend.SIGNS].newest("Points2D:labels")

@@ -12,7 +12,7 @@ from caraware_viewer import wire
 from caraware_viewer.detail import sampling_order
 from caraware_viewer.documents import ProcessStatus, RunMap, RunStatus, TrainingStatus
 from caraware_viewer.layout import SENSORS
-from caraware_viewer.messages import SOURCES, known_objects
+from caraware_viewer.messages import SOURCES
 from caraware_viewer.pairing import mean_m
 from caraware_viewer.picture import Picture
 
@@ -173,7 +173,7 @@ def _radio(picture: Picture, vehicle: int) -> list[tuple[str, str]]:
         return []
     _, known, sent, sent_bytes, received = (int(number) for number in neighbours.radio[slot])
     busy = f"channel {100 * float(neighbours.channel_load[slot]):.0f} % busy"
-    counts = np.bincount(neighbours.source[slot, known_objects(neighbours, slot)], minlength=len(SOURCES))
+    counts = np.bincount(neighbours.known_in(slot)[1][:, 2], minlength=len(SOURCES))
     listed = [f"{name} {count}" for name, count in zip(SOURCES[1:], counts[1:], strict=False) if count]
     radio = f"{sent} sent ({sent_bytes} B) · {received} received · {busy}"
     # Each station's view of an object is one; what is sent and drawn is the nearest objects.

@@ -33,13 +33,6 @@ _DEVIATIONS_95 = 2.45
 _EMPTY = np.empty((0, 2), np.float32)
 
 
-def known_objects(neighbours: wire.Neighbours, slot: int | None) -> NDArray[np.intp]:
-    """Places of the objects that the vehicle in a slot knows, the nearest first."""
-    if slot is None:
-        return np.empty(0, np.intp)
-    return np.flatnonzero(neighbours.source[slot] != 0)
-
-
 def station_of(id_hash: NDArray[np.uint64]) -> NDArray[np.uint32]:
     """Station id `[n]` of road users with these hashes of their ids, as `v2x` gives it."""
     station: NDArray[np.uint32] = np.maximum(id_hash.astype(np.uint64) & np.uint64(0xFFFF_FFFF), 1).astype(np.uint32)
@@ -51,11 +44,9 @@ def draw_messages(
 ) -> None:
     """Draws the map of the followed vehicle, its links, and the senders among the road users `states [n]`."""
     slot = None if followed is None else neighbours.slot_of(int(followed["vehicle"]))
-    known = known_objects(neighbours, slot)
-    row = 0 if slot is None else slot
-    _draw_known(canvas, neighbours, row, known, 0.0 if followed is None else float(followed["z_m"]))
-    if followed is not None:
-        _draw_links(canvas, neighbours, row, known, states, followed)
+    objects, ids = neighbours.known_in(slot)
+    _draw_known(canvas, objects, ids, 0.0 if followed is None else float(followed["z_m"]))
+    _draw_links(canvas, objects, ids, states, followed)
     senders = neighbours.vehicle[neighbours.sent > 0]
     sending = states[np.isin(states["vehicle"], senders)]
     rings = [on_screen(geometry.ring_m(at, 4.0)) for at in geometry.centres_m(sending)[:, :2]]
@@ -63,12 +54,9 @@ def draw_messages(
     canvas.log(SENDERS, line)
 
 
-def _draw_known(
-    canvas: Canvas, neighbours: wire.Neighbours, slot: int, known: NDArray[np.intp], height_m: float
-) -> None:
+def _draw_known(canvas: Canvas, objects: NDArray[np.float32], ids: NDArray[np.uint32], height_m: float) -> None:
     """Draws boxes where the known objects are by now, and the circles that hold 95 % of what their errors allow."""
-    objects = neighbours.objects[slot, known] if len(known) else np.empty((0, neighbours.objects.shape[-1]), np.float32)
-    colors = SOURCE_COLORS[np.minimum(neighbours.source[slot, known], len(SOURCES) - 1)] if len(known) else []
+    colors = SOURCE_COLORS[np.minimum(ids[:, 2], len(SOURCES) - 1)]
     centres_m = now_m(objects)
     sizes_m = np.maximum(objects[:, 5:7], _LEAST_SIZE_M)
     outlines = on_screen(geometry.boxes_m(centres_m, objects[:, 4], sizes_m))
@@ -77,7 +65,7 @@ def _draw_known(
         on_screen(geometry.ring_m(at, _DEVIATIONS_95 * float(deviation_m)))
         for at, deviation_m in zip(centres_m, objects[:, 8], strict=True)
     ]
-    faint = np.asarray(colors, np.uint32) & 0xFFFFFF00 | 0x60
+    faint = colors & 0xFFFFFF00 | 0x60
     canvas.log(DEVIATIONS, rr.LineStrips2D(circles, colors=faint, radii=rr.Radius.ui_points(0.6), draw_order=24.5))
     boxes = rr.Boxes3D(
         centers=np.column_stack([centres_m, np.full(len(objects), height_m + _HEIGHT_M / 2)]),
@@ -97,28 +85,27 @@ def now_m(objects: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _draw_links(
     canvas: Canvas,
-    neighbours: wire.Neighbours,
-    slot: int,
-    known: NDArray[np.intp],
+    objects: NDArray[np.float32],
+    ids: NDArray[np.uint32],
     states: NDArray[np.void],
-    followed: np.void,
+    followed: np.void | None,
 ) -> None:
     """Draws a line to each station that the vehicle knows something from: the fresher, the brighter."""
-    own = station_of(np.array([followed["id_hash"]], np.uint64))[0]
-    heard_from, ages_s = neighbours.ids[slot, known, 1], neighbours.objects[slot, known, 7]
+    start = np.array([] if followed is None else [followed], states.dtype)
+    own, heard_from, ages_s = station_of(start["id_hash"]), ids[:, 1], objects[:, 7]
     places_m = dict(zip(station_of(states["id_hash"]).tolist(), geometry.centres_m(states)[:, :2], strict=True))
     # A station that is no road user, such as a roadside unit, is where it says that it is.
-    itself = neighbours.ids[slot, known, 0] == heard_from
-    said_m = now_m(neighbours.objects[slot, known[itself]])
+    itself = ids[:, 0] == heard_from
+    said_m = now_m(objects[itself])
     places_m = dict(zip(heard_from[itself].tolist(), said_m, strict=True)) | places_m
     ends, colors = [], []
     for station in np.unique(heard_from):
-        if station != own and int(station) in places_m:
+        if station not in own and int(station) in places_m:
             age_s = float(ages_s[heard_from == station].min())
             ends.append(places_m[int(station)])
             colors.append(LINK_COLOR | int(0xFF - 0xC0 * min(max(age_s, 0.0) / _FRESH_S, 1.0)))
     points = np.array(ends, np.float32) if ends else _EMPTY
-    start = geometry.centres_m(np.array([followed], states.dtype))[:, :2]
-    links = on_screen(geometry.links_m(points, np.broadcast_to(start, points.shape)))
+    here = np.broadcast_to(geometry.centres_m(start)[:, :2], points.shape) if ends else _EMPTY
+    links = on_screen(geometry.links_m(points, here))
     line = rr.LineStrips2D(links, colors=np.array(colors, np.uint32), radii=rr.Radius.ui_points(0.9), draw_order=19.5)
     canvas.log(LINKS, line)

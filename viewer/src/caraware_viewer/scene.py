@@ -201,6 +201,8 @@ class Scene:
         if before is not None and before.header.episode != world.header.episode:
             self._contacts.clear()
             self._clouds.clear()
+            # Its vehicles are counted anew.
+            self._picture.neighbours = None
         self._set_tick(world.header)
         self._drawn_at.append(self._clock())
         self._age_ms = sample.age_ms()

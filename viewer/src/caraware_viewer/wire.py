@@ -149,12 +149,6 @@ class Neighbours:
     vehicle: NDArray[np.uint32]
 
     @property
-    def source(self) -> NDArray[np.uint32]:
-        """`[n, k]`: the message that an object is known from; 0 where there is no object."""
-        source: NDArray[np.uint32] = self.ids[:, :, 2]
-        return source
-
-    @property
     def sent(self) -> NDArray[np.uint32]:
         """`[n]`: messages sent in the tick before."""
         sent: NDArray[np.uint32] = self.radio[:, 2]
@@ -164,6 +158,13 @@ class Neighbours:
         """Slot of a vehicle by its index; `None` if it has none, or no radio."""
         found = np.flatnonzero((self.vehicle == vehicle) & (self.radio[:, 0] != 0))
         return int(found[0]) if len(found) else None
+
+    def known_in(self, slot: int | None) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+        """`objects [m, 11]` and `ids [m, 3]` that a slot's vehicle knows, the nearest first; none without a slot."""
+        if slot is None:
+            return self.objects[:0].reshape(0, self.objects.shape[-1]), self.ids[:0].reshape(0, self.ids.shape[-1])
+        known = self.ids[slot, :, 2] != 0
+        return self.objects[slot, known], self.ids[slot, known]
 
 
 _KNOWN = tuple(name for name in Neighbours.__dataclass_fields__ if name != "header")
