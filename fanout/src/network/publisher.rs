@@ -44,12 +44,18 @@ struct LatestValue {
 /// The newest value of every key.
 type LatestValues = Arc<Mutex<BTreeMap<String, LatestValue>>>;
 
+/// How often zenoh is asked whether a key has a subscriber.
+const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
+
 /// A publisher of one key.
 pub struct KeyPublisher {
     publisher: Publisher<'static>,
     key: String,
     encoding: Encoding,
     sequence: u64,
+    /// The newest answer to whether a client subscribes, and when zenoh is asked next.
+    is_watched: bool,
+    ask_at: Duration,
 }
 
 impl KeyPublisher {
@@ -60,6 +66,15 @@ impl KeyPublisher {
             .matching_status()
             .wait()
             .is_ok_and(|status| status.matching())
+    }
+
+    /// As [`KeyPublisher::has_subscriber`], at most [`MATCHING_INTERVAL`] late: `now` is the time since the start.
+    pub fn is_watched(&mut self, now: Duration) -> bool {
+        if now >= self.ask_at {
+            self.ask_at = now + MATCHING_INTERVAL;
+            self.is_watched = self.has_subscriber();
+        }
+        self.is_watched
     }
 }
 
@@ -142,6 +157,8 @@ impl EnvironmentPublisher {
             key: key.to_owned(),
             encoding,
             sequence: 0,
+            is_watched: false,
+            ask_at: Duration::ZERO,
         })
     }
 
@@ -244,10 +261,10 @@ impl EnvironmentPublisher {
         self.topics.values().any(KeyPublisher::has_subscriber)
     }
 
-    /// True while a client subscribes to the topic.
-    #[must_use]
-    pub fn is_watched(&self, topic: Topic) -> bool {
-        self.topics.get(&topic).is_some_and(KeyPublisher::has_subscriber)
+    /// True while a client subscribes to the topic, as [`KeyPublisher::is_watched`].
+    pub fn is_watched(&mut self, topic: Topic, now: Duration) -> bool {
+        let key_publisher = self.topics.get_mut(&topic);
+        key_publisher.is_some_and(|key_publisher| key_publisher.is_watched(now))
     }
 }
 

@@ -24,8 +24,6 @@ use crate::{
     status::FanoutCounters,
 };
 
-/// How often zenoh is asked whether a key has a subscriber.
-const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
 /// A vehicle without a scan for this long has left.
 const VEHICLE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -33,9 +31,6 @@ const VEHICLE_TIMEOUT: Duration = Duration::from_secs(5);
 struct ScanStream {
     key_publisher: KeyPublisher,
     budget: RateBudget,
-    has_subscriber: bool,
-    /// When zenoh is next asked for subscribers.
-    ask_at: Duration,
     last_scan_at: Duration,
 }
 
@@ -152,8 +147,6 @@ impl ScanTopics {
             let stream = ScanStream {
                 key_publisher: publisher.declare_scan(&name)?,
                 budget: RateBudget::new(self.rate_hz),
-                has_subscriber: false,
-                ask_at: Duration::ZERO,
                 last_scan_at: now,
             };
             self.streams.insert((id_hash, sensor), stream);
@@ -163,11 +156,7 @@ impl ScanTopics {
         };
         // Is there a subscriber, and is a scan due?
         stream.last_scan_at = now;
-        if now >= stream.ask_at {
-            stream.ask_at = now + MATCHING_INTERVAL;
-            stream.has_subscriber = stream.key_publisher.has_subscriber();
-        }
-        if !stream.has_subscriber || !stream.budget.allows(now) {
+        if !stream.key_publisher.is_watched(now) || !stream.budget.allows(now) {
             return Ok(0);
         }
         // Publish it.

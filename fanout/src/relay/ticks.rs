@@ -24,9 +24,6 @@ use crate::{
 /// How long messages of different ticks wait for one another before they are published as they are.
 const COMMON_TICK_LIMIT: Duration = Duration::from_millis(500);
 
-/// How often zenoh is asked whether a topic has a subscriber.
-const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
-
 /// The channels with a message for each tick, in the order of the data.
 const TICK_CHANNELS: [(Channel, Topic); 4] = [
     (Channel::World, Topic::World),
@@ -61,8 +58,6 @@ pub struct TickTopics {
     predicts_positions: bool,
     /// Since when the held messages have no tick in common.
     apart_since: Option<Duration>,
-    /// When zenoh is next asked for subscribers.
-    ask_at: Duration,
 }
 
 impl TickTopics {
@@ -102,7 +97,6 @@ impl TickTopics {
             figures: TickFigures::default(),
             predicts_positions: membership.run.config.task.kind == TaskKind::Localisation,
             apart_since: None,
-            ask_at: Duration::ZERO,
         })
     }
 
@@ -126,13 +120,10 @@ impl TickTopics {
         publisher: &mut EnvironmentPublisher,
         counters: &mut FanoutCounters,
     ) -> Result<(), FanoutError> {
-        if now >= self.ask_at {
-            self.ask_at = now + MATCHING_INTERVAL;
-            self.streams
-                .iter_mut()
-                .filter(|stream| is_on_demand(stream.topic))
-                .for_each(|stream| stream.is_watched = publisher.is_watched(stream.topic));
-        }
+        self.streams
+            .iter_mut()
+            .filter(|stream| is_on_demand(stream.topic))
+            .for_each(|stream| stream.is_watched = publisher.is_watched(stream.topic, now));
         // Every budget is asked: asking is what refills it. A channel without a tick to publish makes nothing due: the others' newest
         // tick would be skipped, and in a paused run no other follows.
         let mut due = false;
