@@ -180,18 +180,28 @@ impl Player {
 
     /// Sends an observation, or what is known from messages, to viewers, and to the trainer as the simulators do.
     fn play_tick(&mut self, channel: Channel, header: MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
-        let message = TickMessage {
-            header,
-            payload: payload.to_vec(),
-        };
-        let Some(sent) = self.outputs.take(&mut self.membership, channel, message)? else {
-            return Ok(Wait::Stopped);
-        };
-        for TickMessage { header, payload } in sent {
-            self.digest.add(&header, &payload);
-            self.report(&header, &payload);
+        if !self.outputs.are_paired() {
+            return self.send_tick(channel, &header, payload);
+        }
+        let payload = payload.to_vec();
+        self.outputs.keep(channel, TickMessage { header, payload });
+        while let Some(pair) = self.outputs.next_pair() {
+            for (channel, message) in [Channel::Observation, Channel::Neighbours].into_iter().zip(pair) {
+                if self.send_tick(channel, &message.header, &message.payload)? == Wait::Stopped {
+                    return Ok(Wait::Stopped);
+                }
+            }
         }
         Ok(Wait::Ready)
+    }
+
+    fn send_tick(&mut self, channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
+        let sent = self.outputs.send(&mut self.membership, channel, header, payload)?;
+        if sent == Wait::Ready && channel == Channel::Observation {
+            self.digest.add(header, payload);
+            self.report(header, payload);
+        }
+        Ok(sent)
     }
 
     fn report(&mut self, header: &MessageHeader, payload: &[u8]) {

@@ -50,43 +50,19 @@ impl TickOutputs {
         })
     }
 
-    /// Takes a message of `channel`, and sends what it completes once that may be sent. Returns the observations that are sent; `None` if
-    /// the process is asked to stop. A message of `neighbours` is left out where the run has none.
-    ///
-    /// # Errors
-    /// A port or the journal is broken.
-    pub fn take(
-        &mut self,
-        membership: &mut RunMembership,
-        channel: Channel,
-        message: TickMessage,
-    ) -> Result<Option<Vec<TickMessage>>, Failure> {
-        let is_observation = channel == Channel::Observation;
-        let mut sent = Vec::new();
-        if self.neighbours.is_none() || !self.observations.has_trainer() {
-            if !is_observation && self.neighbours.is_none() {
-                return Ok(Some(sent));
-            }
-            if self.send(membership, channel, &message)? == Wait::Stopped {
-                return Ok(None);
-            }
-            sent.extend(is_observation.then_some(message));
-            return Ok(Some(sent));
-        }
-        self.waiting[usize::from(!is_observation)].push_back(message);
-        while let Some([observation, neighbours]) = self.next_pair() {
-            if self.send(membership, Channel::Observation, &observation)? == Wait::Stopped
-                || self.send(membership, Channel::Neighbours, &neighbours)? == Wait::Stopped
-            {
-                return Ok(None);
-            }
-            sent.push(observation);
-        }
-        Ok(Some(sent))
+    /// True if messages are sent in pairs: a trainer takes both of a tick.
+    #[must_use]
+    pub fn are_paired(&self) -> bool {
+        self.neighbours.is_some() && self.observations.has_trainer()
+    }
+
+    /// Keeps a message of `channel` until that of the same tick of the other is there.
+    pub fn keep(&mut self, channel: Channel, message: TickMessage) {
+        self.waiting[usize::from(channel == Channel::Neighbours)].push_back(message);
     }
 
     /// The messages of the first tick that both channels have. What one of them begins with alone is left out.
-    fn next_pair(&mut self) -> Option<[TickMessage; 2]> {
+    pub fn next_pair(&mut self) -> Option<[TickMessage; 2]> {
         let [observations, neighbours] = &mut self.waiting;
         loop {
             let [one, other] = [observations.front()?.header.tick, neighbours.front()?.header.tick];
@@ -98,19 +74,25 @@ impl TickOutputs {
         }
     }
 
-    /// Sends a message once it may be sent or kept.
-    fn send(
+    /// Sends a message of `channel` once it may be sent or kept. One of `neighbours` is left out where the run has no messages.
+    ///
+    /// # Errors
+    /// A port or the journal is broken.
+    pub fn send(
         &mut self,
         membership: &mut RunMembership,
         channel: Channel,
-        TickMessage { header, payload }: &TickMessage,
+        header: &MessageHeader,
+        payload: &[u8],
     ) -> Result<Wait, Failure> {
         let since = Instant::now();
-        let waited = self.wait_until(membership, |outputs| {
-            let output = outputs.of(channel);
-            output.is_none_or(|output| output.takes(header.tick, payload.len()))
+        let waited = self.wait_until(membership, |outputs| match (channel, &outputs.neighbours) {
+            (Channel::Neighbours, None) => true,
+            (Channel::Neighbours, Some(neighbours)) => neighbours.takes(header.tick, payload.len()),
+            _ => outputs.observations.takes(header.tick, payload.len()),
         })?;
         let output = match (channel, &mut self.neighbours) {
+            (Channel::Neighbours, None) => return Ok(waited),
             (Channel::Neighbours, Some(neighbours)) => neighbours,
             _ => &mut self.observations,
         };
@@ -128,18 +110,11 @@ impl TickOutputs {
     /// Waits until the trainer is done and the others have consumed all ticks below `ticks`.
     ///
     /// # Errors
-    /// As [`TickOutputs::take`].
+    /// As [`TickOutputs::send`].
     pub fn wait_for_consumers_end(&mut self, membership: &mut RunMembership, ticks: u64) -> Result<Wait, Failure> {
         self.wait_until(membership, |outputs| {
             outputs.all().all(|output| output.has_ended(ticks))
         })
-    }
-
-    fn of(&self, channel: Channel) -> Option<&TickPublisher> {
-        match channel {
-            Channel::Neighbours => self.neighbours.as_ref(),
-            _ => Some(&self.observations),
-        }
     }
 
     fn all(&self) -> impl Iterator<Item = &TickPublisher> {

@@ -2,7 +2,7 @@
 
 use std::process::{Child, Stdio};
 
-use crate::common::{Workplace, text, until};
+use crate::common::{ACTING, Workplace, text, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -19,23 +19,6 @@ struct WaitingWorld {
     /// What the actions have led to, of a report.
     achieved: fn(&Value) -> Value,
 }
-
-const SMALL: [&str; 14] = [
-    "run.envs=2",
-    "traffic.others=3",
-    "traffic.pedestrians=2",
-    "episode.ticks=110",
-    "episode.training_episodes=6",
-    "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=40",
-    "episode.final_evaluations=1",
-    "trainer.horizon=300",
-    "trainer.plots=false",
-    "trainer.batch_size=150",
-    "trainer.checkpoint_interval=2",
-    "trainer.matmul_precision=float32",
-    "fanout.enabled=false",
-];
 
 /// Four heroes in each world: 300 samples are 38 ticks.
 const DRIVING: WaitingWorld = WaitingWorld {
@@ -68,7 +51,7 @@ const MESSAGES: WaitingWorld = WaitingWorld {
 };
 
 fn arguments<'a>(world: &WaitingWorld, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let settings = SMALL.iter().chain(world.settings).chain(more);
+    let settings = ["run.envs=2"].iter().chain(&ACTING).chain(world.settings).chain(more);
     ["train", world.preset, "--name", name]
         .into_iter()
         .chain(settings.flat_map(|setting| ["--set", setting]))

@@ -7,7 +7,7 @@ use std::{
     process::{Child, Stdio},
 };
 
-use crate::common::{Spectator, Workplace, assert_documented, free_port, text, until, with_mounts};
+use crate::common::{ACTING, Spectator, Workplace, assert_documented, free_port, text, until, with_mounts};
 use ipc_schema::{activity::Awaited, channel::Channel, process::Process};
 use recorder::file::{
     reader::{RecordedMessage, RecordingReader},
@@ -52,6 +52,19 @@ fn learnt(run: &Path) -> String {
         hasher.update(&std::fs::read(file).unwrap());
     }
     format!("{} {}", newest.trim(), hasher.finalize().to_hex())
+}
+
+/// The run `again`, whose report this is, has lost nothing and learnt what the run `live` did.
+fn assert_learnt_alike(workplace: &Workplace, again: &serde_json::Value) {
+    assert_eq!(
+        (&again["lost_ticks"], &again["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert_eq!(
+        learnt(&run_dir(workplace, "again")),
+        learnt(&run_dir(workplace, "live"))
+    );
+    workplace.assert_nothing_left();
 }
 
 /// The ticks of a channel in a recording, as far as it is readable.
@@ -132,15 +145,7 @@ fn learning_from_a_lossless_recording_gives_the_parameters_of_the_run() {
     workplace.succeed(&["replay", "live", "--learn", "--name", "again"]);
     let again = workplace.report("again");
     assert_eq!(again["observation_hash"], live["observation_hash"]);
-    assert_eq!(
-        (&again["lost_ticks"], &again["duplicated_ticks"]),
-        (&0.into(), &0.into())
-    );
-    assert_eq!(
-        learnt(&run_dir(&workplace, "again")),
-        learnt(&run_dir(&workplace, "live"))
-    );
-    workplace.assert_nothing_left();
+    assert_learnt_alike(&workplace, &again);
     for name in ["live", "again"] {
         assert_documented(&run_dir(&workplace, name));
     }
@@ -174,24 +179,8 @@ fn learning_from_a_lossless_recording_gives_the_parameters_of_the_run() {
 #[test]
 fn learning_what_to_say_from_a_recording_gives_the_parameters_of_the_run() {
     let workplace = Workplace::new();
-    let small = [
-        "traffic.cavs=5",
-        "traffic.others=3",
-        "traffic.pedestrians=2",
-        "episode.ticks=110",
-        "episode.training_episodes=6",
-        "episode.evaluation_interval=2",
-        "episode.evaluation_ticks=40",
-        "episode.final_evaluations=1",
-        "trainer.horizon=300",
-        "trainer.batch_size=150",
-        "trainer.hidden=[16]",
-        "trainer.checkpoint_interval=2",
-        "trainer.matmul_precision=float32",
-        "trainer.plots=false",
-        "fanout.enabled=false",
-    ];
-    let settings = small.iter().flat_map(|setting| ["--set", *setting]);
+    let small = ["traffic.cavs=5", "trainer.hidden=[16]"].iter().chain(&ACTING);
+    let settings = small.clone().flat_map(|setting| ["--set", *setting]);
     let train = ["train", "messages", "--name", "live", "--record"].into_iter();
     workplace.succeed(&train.chain(settings).collect::<Vec<_>>());
     let live = workplace.report("live");
@@ -224,18 +213,10 @@ fn learning_what_to_say_from_a_recording_gives_the_parameters_of_the_run() {
         (&live["observation_hash"], &1.into()),
         "{again:#}"
     );
-    assert_eq!(
-        (&again["lost_ticks"], &again["duplicated_ticks"]),
-        (&0.into(), &0.into())
-    );
-    assert_eq!(
-        learnt(&run_dir(&workplace, "again")),
-        learnt(&run_dir(&workplace, "live"))
-    );
-    workplace.assert_nothing_left();
+    assert_learnt_alike(&workplace, &again);
 
     // Without what stations knew there is nothing to learn from.
-    let settings = small.iter().flat_map(|setting| ["--set", *setting]);
+    let settings = small.clone().flat_map(|setting| ["--set", *setting]);
     let bare = [
         "simulate",
         "messages",

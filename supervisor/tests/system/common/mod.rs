@@ -377,6 +377,23 @@ impl Spectator {
     }
 }
 
+/// Short runs of tasks whose world waits for actions: four heroes or stations make 300 samples in 75 ticks of one environment.
+pub const ACTING: [&str; 13] = [
+    "traffic.others=3",
+    "traffic.pedestrians=2",
+    "episode.ticks=110",
+    "episode.training_episodes=6",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=40",
+    "episode.final_evaluations=1",
+    "trainer.horizon=300",
+    "trainer.plots=false",
+    "trainer.batch_size=150",
+    "trainer.checkpoint_interval=2",
+    "trainer.matmul_precision=float32",
+    "fanout.enabled=false",
+];
+
 /// A curriculum on the preset `paper`: three stages, of which the first continues without restarts, a horizon that ends within lessons,
 /// and gates of σ that some updates pass.
 pub const CURRICULUM: [&str; 14] = [
