@@ -37,6 +37,8 @@ def test_a_display_that_has_stopped_is_abandoned() -> None:
         recording.flush(timeout_sec=120)
         server = display._process
         os.kill(server.pid, signal.SIGSTOP)
+        # Until the signal has reached every thread, the others may still accept data.
+        os.waitid(os.P_PID, server.pid, os.WSTOPPED | os.WNOWAIT)
         recording.log("point", rr.Points2D([[1.0, 1.0]]))
         drawing = threading.Thread(target=lambda: None)
         drawing.start()
