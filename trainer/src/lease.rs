@@ -141,6 +141,7 @@ impl Lease {
                 }
                 std::hint::spin_loop();
             }
+            inner.follow_sender();
             if Instant::now() >= until {
                 return Ok(None);
             }

@@ -3,12 +3,11 @@
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, MutexGuard, atomic::AtomicBool},
+    sync::{Arc, LazyLock, Mutex, MutexGuard, atomic::AtomicBool},
     time::{Duration, Instant},
 };
 
 use ipc_schema::{
-    block::Section,
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
@@ -20,11 +19,10 @@ use ipc_schema::{
     prediction::PredictionLayout,
     process::Process,
     run::RunFile,
-    section::SectionSpec,
     services::Channel as Service,
 };
 use pyo3::{
-    exceptions::{PyKeyError, PyRuntimeError, PyValueError},
+    exceptions::{PyRuntimeError, PyValueError},
     prelude::*,
     types::PyTuple,
 };
@@ -39,7 +37,7 @@ use lease::Lease;
 use metrics::Metric;
 use scans::PointCloud;
 use sights::SightMessage;
-use view::SectionView;
+use view::{ArrayTable, SectionView};
 
 /// Longest time between two checks of Python's signals.
 const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(50);
@@ -109,6 +107,8 @@ struct Attached {
     sender: u32,
     /// One more than the newest tick that Python has been given.
     received_ticks: u64,
+    /// Episode of that tick; `None` before the first.
+    episode: Option<u64>,
     ended: bool,
     /// True if the supervisor did not start this process. Then it does not end with the supervisor.
     outside: bool,
@@ -399,6 +399,8 @@ struct TickMessages {
     observation: Message,
     /// In a run with messages between road users.
     neighbours: Option<Message>,
+    /// The first or the last tick of an episode.
+    bounds_episode: bool,
 }
 
 /// The neighbours of the tick of `header`, if they have arrived; those of earlier ticks are repeated, and skipped.
@@ -435,7 +437,7 @@ impl Attached {
         }
     }
 
-    /// The next observation, if one is waiting. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
+    /// The next observation, if one is waiting; if none is, call `follow_sender` before long. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
     /// has been received before is skipped.
     fn next_message(&mut self) -> PyResult<Option<TickMessages>> {
         loop {
@@ -444,7 +446,6 @@ impl Attached {
                 None => self.observations.receive().map_err(|error| failed(&error))?,
             };
             let Some(observation) = observation else {
-                self.follow_sender();
                 return Ok(None);
             };
             let header = *observation.header();
@@ -459,18 +460,29 @@ impl Attached {
                     Some(neighbours) => Some(neighbours),
                     None => {
                         self.unpaired = Some(observation);
-                        self.follow_sender();
                         return Ok(None);
                     }
                 },
             };
             self.ended |= header.has(header::LAST_OF_RUN);
             self.received_ticks = header.tick + 1;
+            let is_first = self.episode.replace(header.episode) != Some(header.episode);
             return Ok(Some(TickMessages {
                 observation,
                 neighbours,
+                bounds_episode: is_first || header.has(header::LAST_OF_EPISODE),
             }));
         }
+    }
+
+    /// All observations that are waiting.
+    fn waiting_blocks(&mut self) -> PyResult<Vec<ObservationBlock>> {
+        let mut blocks = Vec::new();
+        while let Some(messages) = self.next_message()? {
+            let image_shape = self.membership.run.config.camera.observed_shape();
+            blocks.push(ObservationBlock::new(messages, image_shape)?);
+        }
+        Ok(blocks)
     }
 }
 
@@ -528,6 +540,7 @@ impl Attachment {
             sensor_daemon,
             sender,
             received_ticks: first_tick,
+            episode: None,
             ended: false,
             outside,
         };
@@ -557,24 +570,25 @@ impl Attachment {
         let until = deadline.min(Instant::now() + SIGNAL_CHECK_INTERVAL);
         loop {
             for _ in 0..POLLS {
-                let blocks = self.take_waiting()?;
+                let blocks = self.lock()?.waiting_blocks()?;
                 if !blocks.is_empty() {
                     return Ok(blocks);
                 }
                 std::hint::spin_loop();
             }
+            self.lock()?.follow_sender();
             if Instant::now() >= until {
                 return self.wait(Duration::ZERO).map(|()| Vec::new());
             }
         }
     }
 
+    /// The blocks that are waiting, which may be none.
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
         let mut inner = self.lock()?;
-        let mut blocks = Vec::new();
-        let image_shape = inner.membership.run.config.camera.observed_shape();
-        while let Some(messages) = inner.next_message()? {
-            blocks.push(ObservationBlock::new(messages, image_shape)?);
+        let blocks = inner.waiting_blocks()?;
+        if blocks.is_empty() {
+            inner.follow_sender();
         }
         Ok(blocks)
     }
@@ -639,6 +653,9 @@ struct ObservationBlock {
     neighbours: Option<NeighboursBlock>,
     /// Rows, columns and bytes of a pixel of the images in an observation.
     image_shape: Option<[usize; 3]>,
+    /// True for the first and the last tick of an episode, and for the first tick that this process receives.
+    #[pyo3(get)]
+    bounds_episode: bool,
 }
 
 /// The neighbours of a tick in shared memory.
@@ -672,27 +689,12 @@ impl NeighboursBlock {
     }
 }
 
-/// Scalar, shape and place of the section `name` of a payload.
-fn section_of<const N: usize>(
-    name: &str,
-    specs: &[SectionSpec],
-    named: [(&'static str, Section); N],
-    dimensions: &[&str],
-    sizes: [u32; header::DIMENSIONS],
-) -> PyResult<(Section, String, Vec<usize>)> {
-    let (spec, (_, section)) = specs
-        .iter()
-        .zip(named)
-        .find(|(spec, _)| spec.name == name)
-        .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
-    let shape = spec.shape(|dimension| {
-        let mut sizes = dimensions.iter().zip(sizes);
-        sizes
-            .find(|(name, _)| **name == dimension)
-            .map_or(0, |(_, size)| size as usize)
-    });
-    Ok((section, (spec.element)().0, shape))
-}
+/// The arrays of an observation.
+static OBSERVATION_ARRAYS: LazyLock<ArrayTable> =
+    LazyLock::new(|| ArrayTable::new(ObservationLayout::SECTIONS, ObservationLayout::DIMENSIONS));
+/// The arrays of its neighbours.
+static NEIGHBOURS_ARRAYS: LazyLock<ArrayTable> =
+    LazyLock::new(|| ArrayTable::new(NeighboursLayout::SECTIONS, NeighboursLayout::DIMENSIONS));
 
 impl ObservationBlock {
     fn new(messages: TickMessages, image_shape: Option<[usize; 3]>) -> PyResult<Self> {
@@ -700,6 +702,7 @@ impl ObservationBlock {
         let TickMessages {
             observation: message,
             neighbours,
+            bounds_episode,
         } = messages;
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
@@ -712,6 +715,7 @@ impl ObservationBlock {
             _message: Mutex::new(message),
             neighbours: neighbours.map(NeighboursBlock::new).transpose()?,
             image_shape,
+            bounds_episode,
         })
     }
 }
@@ -796,36 +800,24 @@ impl ObservationBlock {
         self.payload_address
     }
 
-    /// The bytes of one array ("observation", "truth", "gnss_m", …: `ipc_schema::observation::ObservationLayout`)
-    /// as a read-only buffer over shared memory.
+    /// One array ("observation", "truth", "gnss_m", …: `ipc_schema::observation::ObservationLayout`) as a read-only buffer over shared
+    /// memory.
     fn section(slf: Bound<'_, Self>, name: &str) -> PyResult<SectionView> {
         let block = slf.get();
-        let (section, scalar, shape) = section_of(
-            name,
-            ObservationLayout::SECTIONS,
-            block.layout.named(),
-            ObservationLayout::DIMENSIONS,
-            block.header.shape,
-        )?;
-        let address = block.payload_address;
-        Ok(SectionView::new(slf.unbind(), address, section, scalar, shape))
+        let (sections, sizes, address) = (block.layout.named(), block.header.shape, block.payload_address);
+        OBSERVATION_ARRAYS.view(name, slf.unbind(), address, sections, sizes)
     }
 
-    /// The bytes of one array of the neighbours of this tick ("objects", "ids", …: `ipc_schema::neighbours::NeighboursLayout`); `None` in
-    /// a run without messages between road users (`v2x.share`).
+    /// One array of the neighbours of this tick ("objects", "ids", …: `ipc_schema::neighbours::NeighboursLayout`); `None` in a run without
+    /// messages between road users (`v2x.share`).
     fn neighbours(slf: Bound<'_, Self>, name: &str) -> PyResult<Option<SectionView>> {
         let Some(neighbours) = &slf.get().neighbours else {
             return Ok(None);
         };
-        let (section, scalar, shape) = section_of(
-            name,
-            NeighboursLayout::SECTIONS,
-            neighbours.layout.named(),
-            NeighboursLayout::DIMENSIONS,
-            neighbours.shape,
-        )?;
-        let address = neighbours.payload_address;
-        Ok(Some(SectionView::new(slf.unbind(), address, section, scalar, shape)))
+        let (sections, sizes, address) = (neighbours.layout.named(), neighbours.shape, neighbours.payload_address);
+        NEIGHBOURS_ARRAYS
+            .view(name, slf.unbind(), address, sections, sizes)
+            .map(Some)
     }
 }
 

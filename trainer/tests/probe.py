@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from caraware import _native
+from caraware.data import layout
 from caraware.ipc.channel import Channel, Observation
 from caraware.learn.build import build_ppo
 from caraware.learn.ppo import Ppo
@@ -37,10 +39,29 @@ def position_m(normalised: torch.Tensor, bounds: list[float]) -> torch.Tensor:
     return low + (normalised[..., :2] + 1) / 2 * (high - low)
 
 
+def differing_sections(obs: Observation) -> list[str]:
+    """The sections whose array is not, in place, type and shape, what `layout.json` says."""
+    (payload,) = (row for row in json.loads(_native.LAYOUT_JSON)["payloads"] if row["name"] == "observation")
+    arrays = {name: np.asarray(obs.block.section(name)) for name in layout.sections("observation")}
+    sizes = {
+        dimension: size
+        for section in payload["sections"]
+        for dimension, size in zip(section["dimensions"], arrays[section["name"]].shape, strict=False)
+    }
+    places = layout.places("observation", tuple(sizes[name] for name in payload["dimensions"]))
+    return [
+        name
+        for name, place in places.items()
+        if (arrays[name].dtype, arrays[name].shape, arrays[name].flags.writeable) != (place.dtype, place.shape, False)
+        or arrays[name].__array_interface__["data"][0] - obs.block.address != place.offset
+    ]
+
+
 def check_tick(obs: Observation, bounds: list[float], found: dict[str, Any]) -> None:
     """Check one tick: it lies in shared memory, is read-only, and each row belongs to one vehicle."""
     views = (obs.observation, obs.truth, obs.gnss_m)
     found["in_shared_memory"] &= all(lies_in_shared_memory(view.data_ptr()) for view in views)
+    found["differing_sections"] += differing_sections(obs)
     found["in_the_block"] &= obs.observation.data_ptr() == obs.block.address
     rows = torch.from_numpy(np.flatnonzero(obs.valid))
     error = (position_m(obs.observation[rows], bounds) - obs.truth[rows, :2]).abs()
@@ -82,6 +103,7 @@ def main(run_file: str) -> None:
     config = RunConfig.from_run(channel.run)
     bounds = channel.run["map"]["bounds_m"]
     found: dict[str, Any] = {
+        "differing_sections": [],
         **dict.fromkeys(("in_shared_memory", "in_the_block", "distinct_vehicles"), True),
         **dict.fromkeys(("largest_position_error_m", "largest_batch_error_m", "largest_reward_error"), 0.0),
         **dict.fromkeys(("writable", "refused_writes", "samples", "foreign_samples", "env_steps"), 0),

@@ -60,6 +60,7 @@ def test_observation_action_reward_and_truth_belong_to_the_same_vehicle_and_tick
 
 def test_the_observation_lies_in_shared_memory_and_cannot_be_written(found: dict[str, Any]) -> None:
     assert found["in_shared_memory"]
+    assert found["differing_sections"] == []
     assert found["in_the_block"]
     assert not found["writable"]
     assert found["refused_writes"] == 2 * found["ticks"]

@@ -272,17 +272,21 @@ class ObservationBlock:
         """True for the last tick of the run."""
 
     @property
+    def bounds_episode(self) -> bool:
+        """True for the first and the last tick of an episode, and for the first tick that this process receives."""
+
+    @property
     def address(self) -> int:
         """Address of the payload, which proves where it lies."""
 
     def section(self, name: str) -> SectionView:
-        """The bytes of one array (`observation`, `truth`, `gnss_m`, …) as a read-only buffer over shared memory.
+        """One array (`observation`, `truth`, `gnss_m`, …) as a read-only buffer over shared memory.
 
         `ipc_schema::observation::ObservationLayout` lists the names. Raises KeyError for any other.
         """
 
     def neighbours(self, name: str) -> SectionView | None:
-        """The bytes of one array of the neighbours of this tick (`objects`, `ids`, `radio`, …), read-only.
+        """One array of the neighbours of this tick (`objects`, `ids`, `radio`, …), read-only.
 
         None in a run without messages between road users (`v2x.share`). `ipc_schema::neighbours::NeighboursLayout`
         lists the names. Raises KeyError for any other.
@@ -290,15 +294,7 @@ class ObservationBlock:
 
 @final
 class SectionView:
-    """One array of an observation block as a read-only buffer of bytes; it keeps the block alive."""
-
-    @property
-    def scalar(self) -> str:
-        """Scalar of the array, as numpy writes it: `<f4`."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the array."""
+    """One array of an observation block as a read-only buffer with its type and shape; it keeps the block alive."""
 
     def __buffer__(self, flags: int, /) -> memoryview: ...
 

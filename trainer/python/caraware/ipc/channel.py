@@ -150,9 +150,9 @@ class Observation:
         return self.block.stage
 
     def array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
-        """The section `name` in the shape that the extension knows; `scalar` names its type for the type checker."""
-        view = self.block.section(name)
-        return np.frombuffer(memoryview(view), dtype=scalar).reshape(view.shape)
+        """The section `name` in its type and shape; `scalar` names the type for the type checker."""
+        array: NDArray[Scalar] = np.asarray(self.block.section(name))
+        return array
 
     @cached_property
     def observation(self) -> Tensor:
@@ -307,7 +307,8 @@ class Neighbours:
         view = self._block.neighbours(name)
         if view is None:
             raise RuntimeError("no messages in this run: set `v2x.share` above 0")
-        return np.frombuffer(memoryview(view), dtype=scalar).reshape(view.shape)
+        array: NDArray[Scalar] = np.asarray(view)
+        return array
 
     @cached_property
     def objects(self) -> Tensor:
@@ -431,8 +432,7 @@ class Channel:
         if not blocks and self._answer is not None:
             self._answer_again(self._answer)
         for block in blocks:
-            # Nearly all ticks neither begin nor end an episode, and half a microsecond counts here.
-            if block.episode_last or block.episode != self._starts.newest:
+            if block.bounds_episode:
                 self._starts.note(block)
         return [self._tick_of(block) for block in blocks]
 
