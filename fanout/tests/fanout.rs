@@ -3,7 +3,7 @@
 #[cfg(test)]
 mod harness;
 
-use std::{io::Write as _, mem::offset_of, net::TcpStream};
+use std::{collections::BTreeSet, io::Write as _, mem::offset_of, net::TcpStream};
 
 use bytemuck::{cast_slice, pod_read_unaligned};
 use fanout::{frame::HEADER_BYTES, network::keys::Topic};
@@ -13,7 +13,7 @@ use harness::{
 };
 use ipc_schema::{
     SCHEMA_VERSION,
-    board::State,
+    board::{State, TrainingStatus},
     failure::Failure,
     header::{LAST_OF_RUN, MessageHeader},
     pointcloud::Scan,
@@ -173,6 +173,58 @@ fn a_late_joiner_has_the_whole_picture() {
     );
     let health = sim.board_of(Process::Fanout).unwrap().health();
     assert_eq!((health.state, health.ticks, health.drops), (State::Done as u32, 2, 0));
+}
+
+/// Names of all members of a JSON value, each with those of the objects around it.
+fn members(value: &serde_json::Value, around: &str, found: &mut BTreeSet<String>) {
+    match value {
+        serde_json::Value::Object(map) => {
+            for (name, value) in map {
+                let path = format!("{around}/{name}");
+                members(value, &path, found);
+                found.insert(path);
+            }
+        }
+        serde_json::Value::Array(values) => values.iter().for_each(|value| members(value, around, found)),
+        _ => {}
+    }
+}
+
+/// The example of a status in docs/fanout.md has the members that a status has, and each example the version of the schema.
+#[test]
+fn the_documented_status_has_the_members_of_a_real_one() {
+    let page = include_str!("../../docs/fanout.md");
+    let (_, section) = page.split_once("## `status`").unwrap();
+    let (example, _) = section.split_once("```json\n").unwrap().1.split_once("```").unwrap();
+    let example: serde_json::Value = serde_json::from_str(example).unwrap();
+
+    let run = Run::new("documented", Mode::Train);
+    let _fanout = run.start_fanout();
+    let viewer = run.attach();
+    let (sim, worlds) = publisher(&run, Channel::World);
+    until("attendance", || {
+        sim.board_of(Process::Fanout).unwrap().progress().attached == 1
+    });
+    let (trainer, _predictions) = publisher(&run, Channel::Prediction);
+    let mut learnt = TrainingStatus::default();
+    learnt.metrics.fill(5.0);
+    trainer.board().set_training(learnt);
+    send_world(&sim, &worlds, 0, 0, 3);
+    let mut real = serde_json::Value::Null;
+    until("a status with the task's metrics", || {
+        let status = ask(&viewer, &run.key(Topic::Status));
+        real = status.map_or(real.take(), |status| serde_json::from_slice(&status).unwrap());
+        !real["training"]["metrics"][0].is_null()
+    });
+    let [documented, sent] = [&example, &real].map(|status| {
+        let mut found = BTreeSet::new();
+        members(status, "", &mut found);
+        found
+    });
+    assert_eq!(documented, sent);
+    let versions = page.split("\"schema_version\": ").skip(1);
+    let versions: Vec<&str> = versions.filter_map(|rest| rest.split(',').next()).collect();
+    assert_eq!(versions, vec![real["schema_version"].to_string(); 3]);
 }
 
 /// A producer far ahead of the rate is not slowed down: the fan-out misses ticks, counts them, and publishes the newest.
