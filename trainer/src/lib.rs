@@ -107,7 +107,7 @@ struct Attached {
     sender: u32,
     /// One more than the newest tick that Python has been given.
     received_ticks: u64,
-    /// Episode of that tick; `None` before the first.
+    /// Episode of the newest tick that `receive` has returned, which lent ticks do not change; `None` before the first.
     episode: Option<u64>,
     ended: bool,
     /// True if the supervisor did not start this process. Then it does not end with the supervisor.
@@ -399,8 +399,6 @@ struct TickMessages {
     observation: Message,
     /// In a run with messages between road users.
     neighbours: Option<Message>,
-    /// The first or the last tick of an episode.
-    bounds_episode: bool,
 }
 
 /// The neighbours of the tick of `header`, if they have arrived; those of earlier ticks are repeated, and skipped.
@@ -437,8 +435,9 @@ impl Attached {
         }
     }
 
-    /// The next observation, if one is waiting; if none is, call `follow_sender` before long. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
-    /// has been received before is skipped.
+    /// The next observation, if one is waiting; if none is, call `follow_sender` before long.
+    ///
+    /// A `sensor-daemon` that was started again sends what it cannot know to have arrived: what has been received before is skipped.
     fn next_message(&mut self) -> PyResult<Option<TickMessages>> {
         loop {
             let observation = match self.unpaired.take() {
@@ -466,11 +465,9 @@ impl Attached {
             };
             self.ended |= header.has(header::LAST_OF_RUN);
             self.received_ticks = header.tick + 1;
-            let is_first = self.episode.replace(header.episode) != Some(header.episode);
             return Ok(Some(TickMessages {
                 observation,
                 neighbours,
-                bounds_episode: is_first || header.has(header::LAST_OF_EPISODE),
             }));
         }
     }
@@ -480,7 +477,10 @@ impl Attached {
         let mut blocks = Vec::new();
         while let Some(messages) = self.next_message()? {
             let image_shape = self.membership.run.config.camera.observed_shape();
-            blocks.push(ObservationBlock::new(messages, image_shape)?);
+            let header = messages.observation.header();
+            let is_first = self.episode.replace(header.episode) != Some(header.episode);
+            let bounds_episode = is_first || header.has(header::LAST_OF_EPISODE);
+            blocks.push(ObservationBlock::new(messages, image_shape, bounds_episode)?);
         }
         Ok(blocks)
     }
@@ -653,7 +653,7 @@ struct ObservationBlock {
     neighbours: Option<NeighboursBlock>,
     /// Rows, columns and bytes of a pixel of the images in an observation.
     image_shape: Option<[usize; 3]>,
-    /// True for the first and the last tick of an episode, and for the first tick that this process receives.
+    /// True for the first and the last tick of an episode, of those that `receive` returns.
     #[pyo3(get)]
     bounds_episode: bool,
 }
@@ -697,12 +697,11 @@ static NEIGHBOURS_ARRAYS: LazyLock<ArrayTable> =
     LazyLock::new(|| ArrayTable::new(NeighboursLayout::SECTIONS, NeighboursLayout::DIMENSIONS));
 
 impl ObservationBlock {
-    fn new(messages: TickMessages, image_shape: Option<[usize; 3]>) -> PyResult<Self> {
+    fn new(messages: TickMessages, image_shape: Option<[usize; 3]>, bounds_episode: bool) -> PyResult<Self> {
         let received_ns = monotonic_ns();
         let TickMessages {
             observation: message,
             neighbours,
-            bounds_episode,
         } = messages;
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();

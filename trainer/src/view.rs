@@ -3,14 +3,18 @@
 use std::ffi::{CStr, c_int};
 
 use ipc_schema::{block::Section, header::DIMENSIONS, section::SectionSpec};
-use pyo3::{exceptions::PyKeyError, ffi, prelude::*};
+use pyo3::{
+    exceptions::{PyKeyError, PyValueError},
+    ffi,
+    prelude::*,
+};
 
 use crate::ObservationBlock;
 
 /// Most dimensions of an array: those of a message, and two of an element.
 const MAX_DIMENSIONS: usize = DIMENSIONS + 2;
 
-/// The arrays of a payload. They are looked up in each tick, where half a microsecond counts.
+/// The arrays of a payload, without sections of text or records. They are looked up in each tick, where half a microsecond counts.
 pub(crate) struct ArrayTable(Vec<ArrayType>);
 
 /// Type and shape of one array of a payload.
@@ -43,7 +47,7 @@ impl ArrayTable {
         Self(specs.iter().filter_map(array).collect())
     }
 
-    /// The array `name` in the payload at `payload_address`, which `block` keeps alive.
+    /// The array `name` in the payload at `payload_address`, which `block` keeps alive. Its shape fills its section exactly.
     pub(crate) fn view<const N: usize>(
         &self,
         name: &str,
@@ -62,13 +66,18 @@ impl ArrayTable {
             dimensions += 1;
         }
         let scalar_bytes = ffi::Py_ssize_t::try_from(array.scalar_bytes)?;
-        let (mut strides, mut stride) = ([0; MAX_DIMENSIONS], scalar_bytes);
+        let (mut strides, mut stride) = ([0; MAX_DIMENSIONS], Some(scalar_bytes));
         for dimension in (0..dimensions).rev() {
-            strides[dimension] = stride;
-            stride *= shape[dimension];
+            strides[dimension] = stride.unwrap_or_default();
+            stride = stride.and_then(|bytes| bytes.checked_mul(shape[dimension]));
         }
         let len = ffi::Py_ssize_t::try_from(section.len)?;
-        debug_assert_eq!(stride, len, "the shape of {name} is that of its section");
+        if stride != Some(len) {
+            let shape = &shape[..dimensions];
+            return Err(PyValueError::new_err(format!(
+                "{name}: {shape:?} does not fit a section of {len} bytes"
+            )));
+        }
         Ok(SectionView {
             _block: block,
             address: payload_address + section.offset,
@@ -128,13 +137,13 @@ impl SectionView {
         }
         let asks_for = |wanted: c_int| flags & wanted == wanted;
         // SAFETY: PyBuffer_FillInfo has filled `view` as bytes. Consumers only read what these pointers point to, as long as they hold
-        // `slf`, which is frozen and never moves. The array is contiguous, so a consumer that asks for neither shape nor strides is
-        // right to take it as bytes.
+        // `slf`, which is frozen and never moves. `ArrayTable::view` checked that the shape has as many bytes as the section. The
+        // array is contiguous, so a consumer that asks for neither shape nor strides is right to take it as bytes.
         unsafe {
-            if asks_for(ffi::PyBUF_FORMAT) {
-                (*view).format = this.format.as_ptr().cast_mut();
-            }
             if asks_for(ffi::PyBUF_ND) {
+                if asks_for(ffi::PyBUF_FORMAT) {
+                    (*view).format = this.format.as_ptr().cast_mut();
+                }
                 (*view).itemsize = this.scalar_bytes;
                 (*view).ndim = this.dimensions;
                 (*view).shape = this.shape.as_ptr().cast_mut();

@@ -273,7 +273,7 @@ class ObservationBlock:
 
     @property
     def bounds_episode(self) -> bool:
-        """True for the first and the last tick of an episode, and for the first tick that this process receives."""
+        """True for the first and the last tick of an episode, of those that `receive` returns."""
 
     @property
     def address(self) -> int:
