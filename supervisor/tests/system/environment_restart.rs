@@ -6,31 +6,11 @@ use std::{
     time::Duration,
 };
 
-use crate::common::{CURRICULUM, Spectator, Workplace, sumo_program, text, tool, until};
+use crate::common::{CURRICULUM, SMALL, Spectator, Workplace, sumo_program, text, tool, until};
 use ipc_schema::process::Process;
 use rustix::process::{Pid, Signal, kill_process};
 
 const SIMULATORS: [&str; 4] = ["traffic-bridge", "sim-core", "sensor-daemon", "v2x"];
-
-/// A few vehicles, four episodes with an evaluation between. Small networks, and no estimates that only viewers see.
-const SMALL: [&str; 16] = [
-    "traffic.cavs=6",
-    "traffic.others=3",
-    "traffic.pedestrians=3",
-    "episode.ticks=140",
-    "episode.training_episodes=4",
-    "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=40",
-    "episode.final_evaluations=1",
-    "trainer.horizon=300",
-    "trainer.plots=false",
-    "trainer.batch_size=150",
-    "trainer.hidden=[32, 32]",
-    "trainer.estimates=never",
-    "trainer.checkpoint_interval=1",
-    "trainer.matmul_precision=float32",
-    "fanout.enabled=false",
-];
 
 fn arguments<'a>(head: &[&'a str], settings: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
     let settings = settings.iter().chain(more).flat_map(|setting| ["--set", setting]);

@@ -6,35 +6,19 @@ use std::{
     sync::OnceLock,
 };
 
-use crate::common::{CURRICULUM, Workplace, text, until};
+use crate::common::{CURRICULUM, SMALL, Workplace, text, until};
 use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Six vehicles, four training episodes with one evaluation in between: 640 ticks of which 80 are evaluations, a checkpoint for every
-/// update. Small networks, and no estimates that only viewers see.
-const SMALL: [&str; 17] = [
-    "traffic.cavs=6",
-    "traffic.others=3",
-    "traffic.pedestrians=3",
-    "episode.ticks=140",
-    "episode.training_episodes=4",
-    "episode.evaluation_interval=2",
-    "episode.evaluation_ticks=40",
-    "episode.final_evaluations=1",
-    "trainer.horizon=300",
-    "trainer.plots=false",
-    "trainer.batch_size=150",
-    "trainer.hidden=[32, 32]",
-    "trainer.estimates=never",
-    "trainer.checkpoint_interval=1",
-    "trainer.checkpoint_keep_every=1",
-    "trainer.matmul_precision=float32",
-    "fanout.enabled=false",
-];
-
 fn arguments<'a>(name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    // A checkpoint for every update is kept.
+    let kept = ["trainer.checkpoint_keep_every=1"];
+    let settings = SMALL
+        .iter()
+        .chain(&kept)
+        .chain(more)
+        .flat_map(|setting| ["--set", setting]);
     ["train", "town", "--name", name].into_iter().chain(settings).collect()
 }
 

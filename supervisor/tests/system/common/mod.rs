@@ -377,6 +377,27 @@ impl Spectator {
     }
 }
 
+/// Six vehicles, four training episodes with one evaluation in between: 640 ticks of which 80 are evaluations, a checkpoint for every
+/// update. Small networks, and no estimates that only viewers see.
+pub const SMALL: [&str; 16] = [
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=140",
+    "episode.training_episodes=4",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=40",
+    "episode.final_evaluations=1",
+    "trainer.horizon=300",
+    "trainer.plots=false",
+    "trainer.batch_size=150",
+    "trainer.hidden=[32, 32]",
+    "trainer.estimates=never",
+    "trainer.checkpoint_interval=1",
+    "trainer.matmul_precision=float32",
+    "fanout.enabled=false",
+];
+
 /// Short runs of tasks whose world waits for actions: four heroes or stations make 300 samples in 75 ticks of one environment.
 pub const ACTING: [&str; 13] = [
     "traffic.others=3",
