@@ -1,7 +1,7 @@
 """A trainer that only reads observations, run by `caraware train --set trainer.module=lease_probe`.
 
-The environment variable LEASE selects how it takes the ticks: `lent` or `received`. It writes a digest of every
-observation to `parts/trainer.json`, so that a test can compare both ways.
+The environment variable LEASE selects how it takes the ticks: `lent`, `received` or `mixed`. It writes what it found,
+such as a digest of every observation, to `parts/trainer.json`, so that a test can compare the ways.
 """
 
 import hashlib
@@ -66,10 +66,32 @@ def received(channel: Channel) -> dict[str, Any]:
     return {"digests": digests}
 
 
+def mixed(channel: Channel) -> dict[str, Any]:
+    """Receive ticks of the first episode, borrow those after it up to the first of the second, then receive again."""
+
+    def give_back(tick: int) -> None:
+        channel.consumed(tick)
+        channel.committed(tick)
+
+    first = channel.receive(60.0)
+    give_back(first[-1].tick)
+    lease = channel.lease()
+    while lease.episode == 0:
+        assert lease.next(60.0) is not None
+        give_back(lease.tick)
+    then = channel.receive(60.0)
+    give_back(then[-1].tick)
+    while not lease.last:
+        assert lease.next(60.0) is not None
+        give_back(lease.tick)
+    blocks = [first[0].block, then[0].block]
+    return {"bounds": [(block.episode, block.bounds_episode) for block in blocks]}
+
+
 def main() -> None:
     """Take all ticks and write the digests."""
     channel = Channel(sys.argv[1])
-    found = leased(channel) if os.environ["LEASE"] == "lent" else received(channel)
+    found = {"lent": leased, "received": received, "mixed": mixed}[os.environ["LEASE"]](channel)
     path = Path(channel.run["run_dir"]) / "parts" / "trainer.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(found))

@@ -96,6 +96,16 @@ def test_a_lent_tensor_has_the_numbers_of_a_kept_observation(tmp_path: Path, mon
     assert lent["places"] < 100
 
 
+def test_an_episode_whose_first_tick_is_lent_begins_for_what_is_received(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LEASE", "mixed")
+    finished = run_with(tmp_path, "lease_probe")
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    part = tmp_path / "runs" / "probe" / "parts" / "trainer.json"
+    assert json.loads(part.read_text())["bounds"] == [[0, True], [1, True]]
+
+
 def test_what_arrived_belongs_to_the_observation_and_comes_again_to_a_successor(tmp_path: Path) -> None:
     more: dict[str, object] = {"v2x.share": 1.0, "v2x.perception_range_m": 40.0, "traffic.cavs": 12}
     more["episode.training_episodes"] = 2
