@@ -563,9 +563,11 @@ impl Channel {
         if !(spec.is_used)(run) {
             return 0;
         }
-        // The required consumers that the run has, at least one subscriber, and the fan-out.
+        // The required consumers that the run has, at least one, the fan-out, and a trainer that watches road users.
+        let required = self.required(run).filter(|&process| process != Recorder).count().max(1);
+        let fanned_out = usize::from(run.config.fanout.enabled && !spec.topics.is_empty());
         let watching = usize::from(self == Self::World && run.config.trainer.road_users);
-        let subscribers = self.required(run).filter(|&process| process != Recorder).count().max(1) + 1 + watching;
+        let subscribers = required + fanned_out + watching;
         // A recorder copies each message as it comes, so it has one in hand.
         let recorded = match run.config.record.records(self) {
             true => (spec.queue_length)(run) + 1,

@@ -17,7 +17,7 @@ use iceoryx2::{
 use crate::{
     SCHEMA_VERSION,
     header::MessageHeader,
-    reserve::{self, ReserveError},
+    reserve::{MessagePages, ReserveError},
     run::RunFile,
     services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
     storage::retry_on_full_disk,
@@ -90,6 +90,7 @@ pub(crate) fn refused(channel: &'static str, action: &'static str) -> impl FnOnc
 #[derive(Debug)]
 pub struct Publisher {
     port: publisher::Publisher<Shm, [u8], MessageHeader>,
+    pages: MessagePages,
     channel: Channel,
     limit: usize,
     max_road_users: u32,
@@ -115,14 +116,15 @@ impl Publisher {
                 .create()
         };
         let port = retry_on_full_disk(create).map_err(|e| refused(channel.name(), "creation of the publisher")(&e))?;
-        {
+        let pages = {
             let loan = || port.loan_slice_uninit(limit.max(1));
             let first = loan().map_err(|e| refused(channel.name(), "loan")(&e))?;
             let second = loan().map_err(|e| refused(channel.name(), "loan")(&e))?;
-            reserve::back_messages(run, channel, first.payload().as_ptr(), second.payload().as_ptr())?;
-        }
+            MessagePages::of(run, channel, first.payload().as_ptr(), second.payload().as_ptr())?
+        };
         Ok(Self {
             port,
+            pages,
             channel,
             limit,
             max_road_users: run.config.traffic.max_road_users,
@@ -136,15 +138,9 @@ impl Publisher {
     /// Longer than laid out, or all messages are in use.
     pub fn loan(&self, header: MessageHeader, len: usize) -> Result<Draft, PortError> {
         self.check_length(len)?;
-        let mut sample = self
-            .port
-            .loan_slice(len)
-            .map_err(|e| refused(self.channel.name(), "loan")(&e))?;
-        *sample.user_header_mut() = header;
-        Ok(Draft {
-            sample,
-            channel: self.channel,
-        })
+        let mut draft = self.loan_unwritten(header, len)?;
+        draft.payload_mut().fill(0);
+        Ok(draft)
     }
 
     /// A message of `len` payload bytes in shared memory that still has the bytes of an older message. The caller writes all that is to
@@ -158,6 +154,7 @@ impl Publisher {
             .port
             .loan_slice_uninit(len)
             .map_err(|e| refused(self.channel.name(), "loan")(&e))?;
+        self.pages.follow(sample.payload().as_ptr())?;
         #[expect(unsafe_code, reason = "the bytes are initialised, only not by this program")]
         // SAFETY: the payload lies in a shared-memory file that the kernel has filled with zeros and that processes of this run have
         // written since; every byte has a value, and every value is a valid `u8`.

@@ -3,7 +3,7 @@
 //! iceoryx2's files are sparse: the kernel allocates a page at the first write to it, and sends SIGBUS if there is none left. Therefore:
 //!
 //! 1. The supervisor allocates all that a run may need in one file, the *reserve*, before it creates the first service.
-//! 2. A process that creates a publisher allocates the messages of the publisher's segment, in place of as many bytes of the reserve.
+//! 2. A process that sends allocates the pages of a message before it is first used, in place of as many bytes of the reserve.
 //! 3. Where iceoryx2 itself writes to a new page while `/dev/shm` is full, the handler of SIGBUS takes the page from the reserve.
 //! 4. What a dead process leaves free returns to the reserve, for its successor.
 
@@ -15,7 +15,10 @@ use std::{
         unix::fs::{MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _},
     },
     path::{Path, PathBuf},
-    sync::{Mutex, Once, OnceLock, PoisonError},
+    sync::{
+        Mutex, Once, OnceLock, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use rustix::{
@@ -39,6 +42,8 @@ const HEADER_BYTES: u64 = 1 << 10;
 const PAGE_BYTES: u64 = 4 << 10;
 /// Bytes that the handler of SIGBUS takes from the reserve at a time.
 const STEP_BYTES: u64 = 64 << 10;
+/// Messages that a publisher allocates beyond the one that it uses.
+const AHEAD: u64 = 4;
 /// Runs that one process takes part in or watches at a time, as far as their reserves are used by the handler of SIGBUS.
 const MOST_RUNS: usize = 8;
 
@@ -107,8 +112,12 @@ pub fn needed_bytes(run: &RunFile) -> u64 {
 
 /// Pages of all messages of a channel, bytes. Each may begin and end amid a page.
 fn channel_bytes(run: &RunFile, channel: Channel) -> u64 {
-    let message = (HEADER_BYTES + channel.max_payload(run) as u64).next_multiple_of(PAGE_BYTES) + PAGE_BYTES;
-    channel.worst_case_messages(run) as u64 * message
+    channel.worst_case_messages(run) as u64 * message_bytes(channel.max_payload(run) as u64)
+}
+
+/// Pages of a message, bytes.
+fn message_bytes(payload_bytes: u64) -> u64 {
+    (HEADER_BYTES + payload_bytes).next_multiple_of(PAGE_BYTES) + PAGE_BYTES
 }
 
 /// Reserves all that the run needs.
@@ -180,58 +189,116 @@ pub fn close_to_others(memory: &SharedMemory) {
     }
 }
 
-/// Allocates the messages of a new segment, in place of as many bytes of the reserve. `first` and `second` are the payloads of the
-/// segment's first two messages: a message begins at the same distance behind the one before.
+/// The pages of a publisher's messages. They are allocated before the messages are first used, in place of as many bytes of the reserve.
 ///
-/// # Errors
-/// The reserve is used up, and shared memory is full.
-pub fn back_messages<T>(
-    run: &RunFile,
+/// Messages in use are always the first ones of a segment, and a run hardly ever uses all that it may. So a run pays for the pages that
+/// it uses; the others stay in the reserve.
+#[derive(Debug)]
+pub(crate) struct MessagePages {
+    memory: SharedMemory,
     channel: Channel,
-    first: *const T,
-    second: *const T,
-) -> Result<(), ReserveError> {
-    let needed_bytes = channel_bytes(run, channel);
-    if needed_bytes == 0 {
-        return Ok(());
+    path: PathBuf,
+    segment: File,
+    /// Bytes of the segment's file.
+    size: u64,
+    /// Address of the first message's payload, in this process and in the file.
+    first: (usize, u64),
+    /// Bytes from one payload to the next.
+    stride: u64,
+    payload_bytes: u64,
+    /// Most messages that the run has reserved memory for.
+    most: u64,
+    /// Messages allocated from the first one on.
+    allocated: AtomicU64,
+}
+
+impl MessagePages {
+    /// The pages of a new segment; those of its first messages are allocated. `first` and `second` are the payloads of its first two
+    /// messages: a message begins at the same distance behind the one before.
+    ///
+    /// # Errors
+    /// The reserve is used up, and shared memory is full.
+    pub(crate) fn of<T>(
+        run: &RunFile,
+        channel: Channel,
+        first: *const T,
+        second: *const T,
+    ) -> Result<Self, ReserveError> {
+        // The very first message may be either of the two.
+        let (first, stride) = (
+            first.addr().min(second.addr()),
+            first.addr().abs_diff(second.addr()) as u64,
+        );
+        let Some((path, begin)) = mapped_file(first) else {
+            let unknown = io::Error::new(io::ErrorKind::NotFound, "the new segment is not mapped");
+            return Err(failed(Path::new("/proc/self/maps"), unknown));
+        };
+        let segment = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .open(&path)
+            .map_err(|error| failed(&path, error))?;
+        let size = segment.metadata().map_err(|error| failed(&path, error))?.len();
+        let pages = Self {
+            memory: run.shared_memory.clone(),
+            channel,
+            path,
+            segment,
+            size,
+            first: (first, begin),
+            stride,
+            payload_bytes: channel.max_payload(run) as u64,
+            most: channel.worst_case_messages(run) as u64,
+            allocated: AtomicU64::new(0),
+        };
+        pages.allocate_up_to(AHEAD)?;
+        Ok(pages)
     }
-    let Some((path, begin)) = mapped_file(first.addr()) else {
-        let unknown = io::Error::new(io::ErrorKind::NotFound, "the new segment is not mapped");
-        return Err(failed(Path::new("/proc/self/maps"), unknown));
-    };
-    let segment = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .open(&path)
-        .map_err(|error| failed(&path, error))?;
-    let size = segment.metadata().map_err(|error| failed(&path, error))?.len();
-    let stride = first.addr().abs_diff(second.addr()) as u64;
-    // Messages in use are always the first ones of a segment; the very first may be either of the two.
-    let begin = match second < first {
-        true => begin.saturating_sub(stride),
-        false => begin,
-    };
-    let payload_bytes = channel.max_payload(run) as u64;
-    // The headers of a message lie before its payload: the allocation of one begins where the payload of the one before ends.
-    let ranges = std::iter::once((0, begin)).chain(
-        (0..channel.worst_case_messages(run) as u64)
-            .map(|message| begin + message * stride)
-            .map(|payload| (payload.saturating_sub(HEADER_BYTES), HEADER_BYTES + payload_bytes)),
-    );
-    let full = |error| match error {
-        Errno::NOSPC => ReserveError::Full {
-            what: channel.name(),
-            needed_bytes,
-            free_bytes: free_bytes(),
-        },
-        error => failed(&path, error),
-    };
-    let _held = take(&run.shared_memory, needed_bytes).map_err(&full)?;
-    for (offset, bytes) in ranges.filter(|(offset, _)| *offset < size) {
-        let bytes = bytes.min(size - offset);
-        allocate(&segment, offset, bytes, FallocateFlags::KEEP_SIZE).map_err(&full)?;
+
+    /// Allocates what the messages after the one at `payload` need: iceoryx2 writes to a message's header before it is known here.
+    ///
+    /// # Errors
+    /// The reserve is used up, and shared memory is full.
+    pub(crate) fn follow<T>(&self, payload: *const T) -> Result<(), ReserveError> {
+        let message = payload.addr().saturating_sub(self.first.0) as u64 / self.stride.max(1);
+        let needed = message + 1 + AHEAD;
+        if needed.min(self.most) <= self.allocated.load(Ordering::Relaxed) {
+            return Ok(());
+        }
+        self.allocate_up_to(needed + STEP_BYTES / self.stride.max(1))
     }
-    Ok(())
+
+    /// Allocates the first `messages`, as far as memory is reserved for them.
+    fn allocate_up_to(&self, messages: u64) -> Result<(), ReserveError> {
+        let messages = messages.min(self.most);
+        let full = |error| match error {
+            Errno::NOSPC => ReserveError::Full {
+                what: self.channel.name(),
+                needed_bytes: messages * self.stride,
+                free_bytes: free_bytes(),
+            },
+            error => failed(&self.path, error),
+        };
+        let allocated = self.allocated.load(Ordering::Relaxed);
+        if messages <= allocated {
+            return Ok(());
+        }
+        // The headers of a message lie before its payload: the allocation of one begins where the payload of the one before ends.
+        let start = (allocated == 0).then_some((0, self.first.1));
+        let ranges = (allocated..messages)
+            .map(|message| self.first.1 + message * self.stride)
+            .map(|payload| (payload.saturating_sub(HEADER_BYTES), HEADER_BYTES + self.payload_bytes))
+            .chain(start)
+            .filter(|(offset, _)| *offset < self.size);
+        let needed_bytes = (messages - allocated) * message_bytes(self.payload_bytes);
+        let _held = take(&self.memory, needed_bytes).map_err(full)?;
+        for (offset, bytes) in ranges {
+            let bytes = bytes.min(self.size - offset);
+            allocate(&self.segment, offset, bytes, FallocateFlags::KEEP_SIZE).map_err(full)?;
+        }
+        self.allocated.fetch_max(messages, Ordering::Relaxed);
+        Ok(())
+    }
 }
 
 /// Frees as many bytes of the reserve as it has, at most `bytes`. Without a reserve it does nothing. The returned lock keeps other

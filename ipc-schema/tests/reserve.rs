@@ -12,8 +12,10 @@ use std::{
 };
 
 use ipc_schema::{
+    SCHEMA_VERSION,
     header::MessageHeader,
     membership::RunMembership,
+    ports::Message,
     process::Process,
     reserve::{self, ReserveError},
     run::RunFile,
@@ -23,10 +25,11 @@ use ipc_schema::{
 /// Environment variable of the process that has a `/dev/shm` of its own.
 const ALONE: &str = "CARAWARE_TEST_ALONE";
 
-fn run_in(directory: &Path) -> RunFile {
+/// A run whose `name` is that of no other test in this process.
+fn run_in(directory: &Path, name: &str) -> RunFile {
     let mut config = common::town();
     config.traffic.max_road_users = 64;
-    common::run_in(directory, "reserve", config)
+    common::run_in(directory, name, config)
 }
 
 /// Files of the run in shared memory that end with `end`.
@@ -43,28 +46,66 @@ fn allocated_bytes(paths: &[PathBuf]) -> u64 {
     paths.iter().map(|path| path.metadata().unwrap().blocks() * 512).sum()
 }
 
-/// Creates a run's services and a publisher, with `disturb` in between, and sends as many messages as can be in use at a time.
+/// Creates a run's services, a publisher and a subscriber, with `disturb` in between, and sends as many messages as can be in use at a
+/// time, each written from end to end.
 fn publish(run: &RunFile, disturb: impl Fn()) {
     let node = services::node(&run.shared_memory).unwrap();
     let _services = ServiceHolder::create(&node, run, 0).unwrap();
-    let stop = Arc::new(AtomicBool::new(false));
-    let producer = RunMembership::join_with(run.clone(), Process::SimCore, 0, stop).unwrap();
+    let join = |process| RunMembership::join_with(run.clone(), process, 0, Arc::new(AtomicBool::new(false))).unwrap();
+    let producer = join(Process::SimCore);
+    let mut consumers = [Process::SensorDaemon, Process::Fanout].map(join);
     disturb();
-    let publisher = producer.publisher(Channel::World).unwrap();
-    let (segments, reserve) = (files(run, ".data"), files(run, "reserve"));
-    let messages = Channel::World.worst_case_messages(run) as u64 * Channel::World.max_payload(run) as u64;
+    let channel = Channel::World;
+    let allocated = || allocated_bytes(&files(run, ".data"));
+    let before = allocated();
+    let publisher = producer.publisher(channel).unwrap();
+    let subscribers = consumers.each_mut().map(|process| process.subscriber(channel).unwrap());
+    let (length, most) = (channel.max_payload(run) as u64, channel.worst_case_messages(run) as u64);
+    let at_first = allocated() - before;
     assert!(
-        allocated_bytes(&segments) >= messages,
-        "{} of {messages}",
-        allocated_bytes(&segments)
+        (length..most * length / 2).contains(&at_first),
+        "{at_first} bytes are allocated before any message is sent"
     );
-    assert!(allocated_bytes(&reserve) + messages <= reserve::needed_bytes(run));
-    // Two messages may be on loan at a time; both are written from end to end.
-    let length = Channel::World.max_payload(run);
-    let drafts = [(); 2].map(|()| publisher.loan(MessageHeader::default(), length).unwrap());
-    for draft in drafts {
-        assert_eq!(draft.send().unwrap(), 0, "no process has subscribed");
+    // The first subscriber holds the first half of the messages, and the second one, which keeps up until then, the other half.
+    let (in_hand, queued) = ((channel.spec().in_hand)(run), channel.queue_length(run));
+    let mut held = Vec::new();
+    for message in 0..2 * (in_hand + queued) {
+        let header = MessageHeader {
+            schema_version: SCHEMA_VERSION,
+            run_id: run.run_id,
+            ..MessageHeader::default()
+        };
+        let mut draft = publisher.loan(header, channel.max_payload(run)).unwrap();
+        draft.payload_mut().fill(byte_of(message));
+        assert!(draft.send().unwrap() > 0);
+        let half = message / (in_hand + queued);
+        if message % (in_hand + queued) < in_hand {
+            held.push((message, subscribers[half].receive().unwrap().unwrap()));
+        }
+        if half == 0 {
+            subscribers[1].receive().unwrap().unwrap();
+        }
     }
+    let reserve = allocated_bytes(&files(run, "reserve"));
+    assert!(
+        reserve + allocated() <= reserve::needed_bytes(run),
+        "{reserve} bytes are left in the reserve"
+    );
+    let check = |(message, received): (usize, Message)| {
+        assert!(
+            received.payload().iter().all(|&byte| byte == byte_of(message)),
+            "message {message} was overwritten"
+        );
+    };
+    held.into_iter().for_each(check);
+    for (half, subscriber) in subscribers.iter().enumerate() {
+        let first = half * (in_hand + queued) + in_hand;
+        (first..first + queued).for_each(|message| check((message, subscriber.receive().unwrap().unwrap())));
+    }
+}
+
+fn byte_of(message: usize) -> u8 {
+    u8::try_from(message % 255).unwrap()
 }
 
 fn remove(run: &RunFile) {
@@ -74,9 +115,9 @@ fn remove(run: &RunFile) {
 }
 
 #[test]
-fn a_publishers_messages_are_allocated_before_the_first_is_sent() {
+fn a_publishers_messages_are_allocated_before_they_are_used() {
     let directory = tempfile::tempdir().unwrap();
-    let run = run_in(directory.path());
+    let run = run_in(directory.path(), "reserve");
     reserve::create(&run).unwrap();
     assert_eq!(
         allocated_bytes(&files(&run, "reserve")),
@@ -90,6 +131,26 @@ fn a_publishers_messages_are_allocated_before_the_first_is_sent() {
     remove(&run);
 }
 
+#[test]
+fn a_run_without_fanout_reserves_no_messages_for_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let with_fanout = run_in(directory.path(), "unwatched");
+    let mut run = with_fanout.clone();
+    run.config.fanout.enabled = false;
+    assert!(reserve::needed_bytes(&run) < reserve::needed_bytes(&with_fanout) * 3 / 4);
+    reserve::create(&run).unwrap();
+    let node = services::node(&run.shared_memory).unwrap();
+    let _services = ServiceHolder::create(&node, &run, 0).unwrap();
+    let bridge = RunMembership::join_with(run.clone(), Process::TrafficBridge, 0, Arc::default()).unwrap();
+    let reserved = || allocated_bytes(&files(&run, "reserve"));
+    let before = reserved();
+    let _census = bridge.publisher(Channel::Census).unwrap();
+    assert_eq!(reserved(), before, "no message of this channel is ever sent");
+    let _traffic = bridge.publisher(Channel::Traffic).unwrap();
+    assert!(reserved() < before);
+    remove(&run);
+}
+
 /// Runs in the process that the test below starts; without the environment variable it does nothing.
 #[test]
 fn a_process_with_its_own_memory() {
@@ -97,7 +158,7 @@ fn a_process_with_its_own_memory() {
         return;
     };
     let directory = tempfile::tempdir().unwrap();
-    let run = run_in(directory.path());
+    let run = run_in(directory.path(), "reserve");
     if mode == "small" {
         let error = reserve::create(&run).unwrap_err();
         assert!(matches!(error, ReserveError::Full { .. }), "{error}");
