@@ -6,7 +6,7 @@
 
 use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
 
-use super::{governor::DrivingLimits, prefetch::PrefetchRange, window::WindowStep};
+use super::{governor::DrivingLimits, prefetch::PrefetchRange, reference::LaneJump, window::WindowStep};
 use crate::trig::wrap_angle;
 
 /// Most frames by which a mirror may be later than it should be.
@@ -30,6 +30,8 @@ const MOST_LATE_M: f64 = 2.0;
 const MOST_LATE_S: f64 = 0.15;
 /// Distance ahead and behind over which a bend is measured, metres.
 const BEND_REACH_M: f64 = 2.0;
+/// Points that it usually reaches behind the mirror.
+const BEHIND_POINTS: usize = 3;
 /// Turns below this are straight, radians.
 const STRAIGHT_RAD: f64 = 1e-4;
 /// Largest distance by which a mirror's place is moved out of a bend, metres.
@@ -48,8 +50,9 @@ pub struct PathLimits {
     pub swing_m2: f64,
 }
 
-/// A mean of SUMO's states on the path.
+/// A mean of SUMO's states on the path, in a cache line of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[repr(align(64))]
 struct PathPoint {
     /// Front bumper.
     position_m: [f64; 3],
@@ -57,8 +60,8 @@ struct PathPoint {
     pitch_rad: f32,
     /// Distance along the path from where it begins, metres.
     station_m: f64,
-    /// Square of the speed that the bend up to here allows, m²/s².
-    bend_square: f32,
+    /// Square of the speed that the bend up to here allows, and from which a mirror can brake to what every bend ahead allows, m²/s².
+    allowed_square: f64,
     /// Distance from SUMO's own path, metres.
     deviation_m: f32,
     lamps: u32,
@@ -87,7 +90,6 @@ pub struct PacedPath {
     narrow_m: f64,
     /// Direction of the path at the newest point, a unit vector; zero where it begins.
     direction: [f64; 2],
-    now: TrafficState,
 }
 
 impl PacedPath {
@@ -106,7 +108,6 @@ impl PacedPath {
             ahead: late,
             narrow_m: f64::NEG_INFINITY,
             direction: [0.0; 2],
-            now: TrafficState::default(),
         }
     }
 
@@ -127,7 +128,7 @@ impl PacedPath {
                 yaw_rad: mean.yaw_rad,
                 pitch_rad: mean.pitch_rad,
                 station_m: -back_m,
-                bend_square: f32::INFINITY,
+                allowed_square: f64::INFINITY,
                 deviation_m: 0.0,
                 lamps: mean.signals,
                 is_narrow: false,
@@ -141,43 +142,40 @@ impl PacedPath {
         self.station_m = self.behind(self.late).station_m;
         self.speed_mps = mean.speed_mps.into();
         self.find_ahead();
-        self.now = self.state(mean);
-        self.now
+        let mut mirror = *mean;
+        self.place_mirror(&mut mirror);
+        mirror
     }
 
-    /// Prefetches the points between the mirror and the next mean.
+    /// Prefetches the points between the mirror, or a little behind it, and the next mean.
     #[inline]
     pub fn prefetch(&self) {
-        let behind = self.ahead + 1;
+        let behind = self.ahead + 1 + BEHIND_POINTS;
         let first = self.newest.saturating_sub(behind);
-        PrefetchRange::new(&self.points, first, self.newest + 2 - first).fetch_all();
+        // The last of them is the oldest point.
+        PrefetchRange::new(&self.points, first, self.newest + 4 - first).fetch_all();
         // Those before the beginning of the ring are at its end.
         let rest = behind.saturating_sub(self.newest);
         PrefetchRange::new(&self.points, self.points.len().saturating_sub(rest), rest).fetch_all();
     }
 
-    /// Takes the next mean, `deviation_m` from SUMO's path, and moves the mirror for a frame. Without `limits` it is on time.
+    /// Takes the next mean and its distance from SUMO's path, and moves the mirror for a frame. Without `limits` it is on time.
     pub fn advance(
         &mut self,
-        step: &WindowStep,
-        deviation_m: f64,
+        (mean, deviation_m): (&TrafficState, f64),
+        step: WindowStep,
         limits: Option<&PathLimits>,
         frame_s: f64,
-    ) -> WindowStep {
-        let [shift_x, shift_y] = step.shift_m;
-        if step.lane_change_m.is_some() {
+        mirror: &mut TrafficState,
+    ) {
+        if let Some(LaneJump { vector_m, .. }) = step.lane_change {
             for point in &mut self.points {
-                point.position_m[0] += shift_x;
-                point.position_m[1] += shift_y;
+                point.position_m[0] += vector_m[0];
+                point.position_m[1] += vector_m[1];
             }
         }
-        self.push(&step.now, deviation_m, limits);
+        self.push(mean, deviation_m, limits);
         self.ahead += 1;
-        let before = TrafficState {
-            front_x_m: self.now.front_x_m + shift_x,
-            front_y_m: self.now.front_y_m + shift_y,
-            ..self.now
-        };
         let aim_m = self.behind(self.late).station_m;
         let aim_mps = (aim_m - self.behind(self.late + 1).station_m) / frame_s;
         (self.station_m, self.speed_mps) = match limits {
@@ -203,14 +201,12 @@ impl PacedPath {
             }
         };
         self.find_ahead();
-        self.now = self.state(&step.now);
+        self.place_mirror(mirror);
+        // What does not move is SUMO's.
+        mirror.accel_mps2 = mean.accel_mps2;
+        mirror.flags = mean.flags;
         if let Some(limits) = limits {
-            self.move_outside(limits.swing_m2);
-        }
-        WindowStep {
-            before,
-            now: self.now,
-            ..*step
+            self.move_outside(limits.swing_m2, mirror);
         }
     }
 
@@ -258,7 +254,8 @@ impl PacedPath {
         let chord = [0, 1].map(|axis: usize| position_m[axis] - last.position_m[axis]);
         let length_m = (chord[0] * chord[0] + chord[1] * chord[1]).sqrt();
         let station_m = last.station_m + length_m;
-        let (mut bend_square, mut is_narrow) = (last.bend_square, last.is_narrow);
+        // No bend ahead of the newest point is known.
+        let (mut allowed_square, mut is_narrow) = (last.allowed_square, last.is_narrow);
         if length_m > APART_M {
             let per_m = 1.0 / length_m;
             let [ahead, left] = chord.map(|part| part * per_m);
@@ -267,31 +264,53 @@ impl PacedPath {
             let (dot, cross) = (cos * ahead + sin * left, (cos * left - sin * ahead).abs());
             let curvature_per_m = if dot >= 0.0 { cross } else { 2.0 } * per_m;
             if let Some(limits) = limits {
-                bend_square = (LATERAL_SHARE * limits.driving.lateral_mps2 / curvature_per_m.max(1e-6)) as f32;
+                // Single precision is enough, and observations keep the hashes that they had with it.
+                allowed_square =
+                    f64::from((LATERAL_SHARE * limits.driving.lateral_mps2 / curvature_per_m.max(1e-6)) as f32);
                 if curvature_per_m > limits.front_curvature_per_m {
                     self.narrow_m = station_m;
                     // It is led there at SUMO's speed: to brake would only make it late.
-                    bend_square = f32::INFINITY;
+                    allowed_square = f64::INFINITY;
                 }
                 is_narrow = curvature_per_m > FAR_TOO_NARROW * limits.front_curvature_per_m;
             }
         }
-        self.newest = (self.newest + 1) % self.points.len();
+        self.newest += 1;
+        if self.newest == self.points.len() {
+            self.newest = 0;
+        }
         self.points[self.newest] = PathPoint {
             position_m,
             yaw_rad: mean.yaw_rad,
             pitch_rad: mean.pitch_rad,
             station_m,
-            bend_square,
+            allowed_square,
             deviation_m: deviation_m as f32,
             lamps: mean.signals,
             is_narrow,
         };
+        self.brake_before(allowed_square, station_m);
+    }
+
+    /// Lowers what the points before the newest allow to what can be braked from. A point that allows no more than that ends the search: so
+    /// do all before it.
+    fn brake_before(&mut self, newest_square: f64, newest_m: f64) {
+        let (mut square, mut next_m) = (newest_square, newest_m);
+        for frames in 1..self.points.len() {
+            let place = self.place(frames);
+            let point = &mut self.points[place];
+            let braking = square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m);
+            if braking >= point.allowed_square {
+                return;
+            }
+            point.allowed_square = braking;
+            (square, next_m) = (braking, point.station_m);
+        }
     }
 
     /// Moves the mirror's place out of a bend: by as much as the mean cuts the corner, and so far that the body is nearer to SUMO's. SUMO's
     /// bodies have both bumpers on the lane, where the rear of one that rolls cuts the corner.
-    fn move_outside(&mut self, swing_m2: f64) {
+    fn move_outside(&mut self, swing_m2: f64, mirror: &mut TrafficState) {
         let [before_rad, after_rad] = [-BEND_REACH_M, BEND_REACH_M].map(|away_m| self.yaw_at(self.station_m + away_m));
         let turn_rad = wrap_angle(after_rad - before_rad);
         self.outside_m = 0.0;
@@ -304,8 +323,8 @@ impl PacedPath {
         let outside_m = outside_m.clamp(-MOST_OUTSIDE_M, MOST_OUTSIDE_M);
         // SUMO's heading is that of the lane under the middle of the body; the front bumper is ahead of it.
         let (sin, cos) = libm::sincos(after_rad);
-        self.now.front_x_m += outside_m * sin;
-        self.now.front_y_m -= outside_m * cos;
+        mirror.front_x_m += outside_m * sin;
+        mirror.front_y_m -= outside_m * cos;
         self.outside_m = outside_m.abs();
     }
 
@@ -325,6 +344,10 @@ impl PacedPath {
     /// Frames by which the first point ahead of a station is behind the newest. The search begins at the mirror's.
     fn first_ahead_of(&self, station_m: f64) -> usize {
         let last = self.points.len() - 2;
+        // A vehicle that stands has all points at one place.
+        if self.behind(last).station_m > station_m {
+            return last;
+        }
         let mut frames = self.ahead.min(last);
         while frames < last && self.behind(frames + 1).station_m > station_m {
             frames += 1;
@@ -337,34 +360,24 @@ impl PacedPath {
 
     /// The speed from which the mirror can brake to what every bend ahead allows, m/s.
     fn bend_speed_mps(&self) -> f64 {
-        let mut square = f64::INFINITY;
-        let mut next_m = self.behind(0).station_m;
-        for frames in 0..=self.ahead {
-            let point = self.behind(frames);
-            // Braking from this point to the next one ahead.
-            let braking = square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m);
-            square = f64::from(point.bend_square).min(braking);
-            next_m = point.station_m;
-        }
-        (square + 2.0 * BRAKE_MPS2 * (next_m - self.station_m).max(0.0)).sqrt()
+        let next = self.behind(self.ahead);
+        (next.allowed_square + 2.0 * BRAKE_MPS2 * (next.station_m - self.station_m).max(0.0)).sqrt()
     }
 
-    /// The state at the mirror's place; what does not move is that of `newest`.
-    fn state(&self, newest: &TrafficState) -> TrafficState {
+    /// Writes place, speed and lamps of the mirror. Number by number, into the state that is read so: a processor waits if it loads as a
+    /// vector what it has just stored otherwise.
+    fn place_mirror(&self, mirror: &mut TrafficState) {
         let (to, from) = (self.behind(self.ahead), self.behind(self.ahead + 1));
         let share = share_of_way(from, to, self.station_m);
         let mix = |axis: usize| from.position_m[axis] + share * (to.position_m[axis] - from.position_m[axis]);
         let turn_rad = wrap_angle(f64::from(to.yaw_rad) - f64::from(from.yaw_rad));
-        TrafficState {
-            front_x_m: mix(0),
-            front_y_m: mix(1),
-            front_z_m: mix(2),
-            yaw_rad: wrap_angle(f64::from(from.yaw_rad) + share * turn_rad) as f32,
-            pitch_rad: from.pitch_rad + share as f32 * (to.pitch_rad - from.pitch_rad),
-            speed_mps: self.speed_mps as f32,
-            signals: to.lamps,
-            ..*newest
-        }
+        mirror.front_x_m = mix(0);
+        mirror.front_y_m = mix(1);
+        mirror.front_z_m = mix(2);
+        mirror.yaw_rad = wrap_angle(f64::from(from.yaw_rad) + share * turn_rad) as f32;
+        mirror.pitch_rad = from.pitch_rad + share as f32 * (to.pitch_rad - from.pitch_rad);
+        mirror.speed_mps = self.speed_mps as f32;
+        mirror.signals = to.lamps;
     }
 }
 
@@ -379,6 +392,8 @@ fn share_of_way(from: &PathPoint, to: &PathPoint, station_m: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const FRAME_S: f64 = 0.1;
@@ -402,6 +417,8 @@ mod tests {
         swing_m2: 0.0,
     };
 
+    const STRAIGHT_ON: WindowStep = WindowStep { lane_change: None };
+
     /// Means of a vehicle at `speed_mps` that drives 40 m straight, a quarter of a circle, and straight on.
     fn means(speed_mps: f64, radius_m: f64) -> impl Iterator<Item = TrafficState> {
         (0..200).map(move |frame| {
@@ -422,17 +439,12 @@ mod tests {
     /// The mirror's states along the means.
     fn paced(means: impl Iterator<Item = TrafficState>, limits: Option<&PathLimits>) -> Vec<TrafficState> {
         let mut path = PacedPath::new(FRAMES);
-        let mut last: Option<TrafficState> = None;
-        let states = means.map(|mean| {
-            let step = last.replace(mean).map(|before| WindowStep {
-                before,
-                now: mean,
-                lane_change_m: None,
-                shift_m: [0.0; 2],
-            });
-            match step {
-                None => path.restart(&mean, FRAME_S),
-                Some(step) => path.advance(&step, 0.0, limits, FRAME_S).now,
+        let mut mirror: Option<TrafficState> = None;
+        let states = means.map(|mean| match &mut mirror {
+            None => *mirror.insert(path.restart(&mean, FRAME_S)),
+            Some(mirror) => {
+                path.advance((&mean, 0.0), STRAIGHT_ON, limits, FRAME_S, mirror);
+                *mirror
             }
         });
         states.collect()
@@ -487,6 +499,41 @@ mod tests {
         assert!(late_m(199) < 0.1, "{} m late at the end", late_m(199));
     }
 
+    proptest! {
+        /// The sum over all points ahead, from the newest to the oldest, is what the points know when each new one only lowers some.
+        #[test]
+        fn every_point_allows_what_can_be_braked_from_before_the_bends_ahead(
+            steps in prop::collection::vec((0.0_f64..2.5, -0.5_f64..0.5), 1..120),
+        ) {
+            let mut path = PacedPath::new(FRAMES);
+            let (mut mean, mut alone) = (TrafficState::default(), std::collections::VecDeque::new());
+            let mut mirror = path.restart(&mean, FRAME_S);
+            let (mut yaw_rad, mut bends) = (0.0, 0);
+            for (length_m, turn_rad) in steps {
+                yaw_rad += turn_rad;
+                let (sin, cos) = libm::sincos(yaw_rad);
+                mean.front_x_m += length_m * cos;
+                mean.front_y_m += length_m * sin;
+                path.advance((&mean, 0.0), STRAIGHT_ON, Some(&LIMITS), FRAME_S, &mut mirror);
+                // Nothing is ahead of the newest point.
+                alone.push_front(path.behind(0).allowed_square);
+                let (mut square, mut next_m) = (f64::INFINITY, path.behind(0).station_m);
+                for frames in 0..path.points.len() {
+                    let point = path.behind(frames);
+                    let braking = square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m);
+                    let own = alone.get(frames).copied().unwrap_or(f64::INFINITY);
+                    bends += usize::from(braking < own);
+                    square = own.min(braking);
+                    next_m = point.station_m;
+                    prop_assert_eq!(point.allowed_square, square, "{} frames behind the newest", frames);
+                }
+                let searched = (0..=path.points.len() - 2).rev().find(|&frames| path.behind(frames).station_m >= path.station_m);
+                prop_assert_eq!(path.behind(path.ahead).station_m, path.behind(searched.unwrap_or(0)).station_m);
+            }
+            prop_assume!(bends > 0);
+        }
+    }
+
     #[test]
     fn a_stop_is_reached_and_left_without_a_jump() {
         // Stops at 1 m after braking with 5 m/s², stands, and starts with 6 m/s², which the limits do not allow.
@@ -536,18 +583,16 @@ mod tests {
             speed_mps: 10.0,
             ..TrafficState::default()
         };
-        path.restart(&at(0.0, 0.0), FRAME_S);
+        let mut mirror = path.restart(&at(0.0, 0.0), FRAME_S);
+        let before = mirror;
         let step = WindowStep {
-            before: at(0.0, 3.2),
-            now: at(1.0, 3.2),
-            lane_change_m: Some(3.2),
-            shift_m: [0.0, 3.2],
+            lane_change: Some(LaneJump {
+                vector_m: [0.0, 3.2],
+                left_m: 3.2,
+            }),
         };
-        let moved = path.advance(&step, 0.0, Some(&LIMITS), FRAME_S);
-        assert_eq!(moved.lane_change_m, Some(3.2));
-        for state in [moved.before, moved.now] {
-            assert!((state.front_y_m - 3.2).abs() < 1e-9, "{state:?}");
-        }
-        assert!((moved.now.front_x_m - moved.before.front_x_m - 1.0).abs() < 1e-9);
+        path.advance((&at(1.0, 3.2), 0.0), step, Some(&LIMITS), FRAME_S, &mut mirror);
+        assert!((mirror.front_y_m - 3.2).abs() < 1e-9, "{mirror:?}");
+        assert!((mirror.front_x_m - before.front_x_m - 1.0).abs() < 1e-9);
     }
 }

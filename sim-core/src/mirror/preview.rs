@@ -37,8 +37,8 @@ impl PathAhead {
     pub fn restart(&mut self, now: &TrafficState, frame_s: f64) -> TrafficState {
         self.recent.clear();
         self.recent.push_front(*now);
-        let mean = self.window.restart(now, frame_s);
-        self.path.restart(&mean, frame_s)
+        self.window.restart(now, frame_s);
+        self.path.restart(self.window.mean(), frame_s)
     }
 
     /// Prefetches what the next state needs, of a path whose own numbers are in the cache.
@@ -49,7 +49,7 @@ impl PathAhead {
         PrefetchRange::new(self.recent.as_slices().0, 0, 1).fetch_all();
     }
 
-    /// Takes the next state of a body of `length_m`, and moves its mirror for a frame. `None` if no vehicle moves like that. A road user
+    /// Takes the next state of a body of `length_m`, and moves its `mirror` for a frame. `None` if no vehicle moves like that. A road user
     /// without `limits` is always on time.
     pub fn advance(
         &mut self,
@@ -57,13 +57,16 @@ impl PathAhead {
         length_m: f64,
         limits: Option<&PathLimits>,
         frame_s: f64,
+        mirror: &mut TrafficState,
     ) -> Option<WindowStep> {
         let step = self.window.advance(now, length_m, frame_s)?;
         if self.recent.len() == self.delay + 2 {
             self.recent.pop_back();
         }
         self.recent.push_front(*now);
-        Some(self.path.advance(&step, self.window.deviation_m(), limits, frame_s))
+        let mean = (self.window.mean(), self.window.deviation_m());
+        self.path.advance(mean, step, limits, frame_s, mirror);
+        Some(step)
     }
 
     /// Frames by which the mirror is behind SUMO.

@@ -306,15 +306,17 @@ impl ReferencePath {
 
 /// A lane change in one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct LaneJump {
+pub struct LaneJump {
     /// World frame, metres.
-    pub(super) vector_m: [f64; 2],
+    pub vector_m: [f64; 2],
     /// Positive to the left, metres.
-    pub(super) left_m: f64,
+    pub left_m: f64,
 }
 
 /// Whether a vehicle of `length_m` can have moved from `before` to `now` in `step_s`, and its lane change meanwhile.
-#[inline]
+///
+/// Inlined: its result would otherwise come through memory, part by part, and be waited for.
+#[inline(always)]
 pub(super) fn join(
     before: &TrafficState,
     now: &TrafficState,

@@ -15,7 +15,7 @@ use super::{
     pace::PathLimits,
     person::Person,
     preview::PathAhead,
-    reference::{PathJoin, ReferencePath},
+    reference::{LaneJump, PathJoin, ReferencePath},
     resynchronisation::{Guidance, Resynchronisation, ResynchronisationCause},
     settings::MirrorSettings,
     tracking,
@@ -201,7 +201,10 @@ impl RoadUser {
             Mover::Person(_) | Mover::Hero(_) => None,
         };
         let step = match self.arrival {
-            Arrival::Continuing => path.advance(now, self.dimensions.length_m, limits, step_s),
+            Arrival::Continuing => {
+                self.before = self.now;
+                path.advance(now, self.dimensions.length_m, limits, step_s, &mut self.now)
+            }
             Arrival::Entering | Arrival::Jumping(_) => None,
         };
         let Some(step) = step else {
@@ -219,14 +222,17 @@ impl RoadUser {
             self.hidden -= 1;
             self.arrival = Arrival::Entering;
         }
-        (self.before, self.now) = (step.before, step.now);
+        if let Some(LaneJump { vector_m, .. }) = step.lane_change {
+            self.before.front_x_m += vector_m[0];
+            self.before.front_y_m += vector_m[1];
+        }
         self.deviation_m = path.deviation_m() as f32;
         self.narrow = match (path.is_narrow(), path.turns_narrowly()) {
             (false, _) => NarrowTurn::None,
             (true, false) => NarrowTurn::Near,
             (true, true) => NarrowTurn::Begins,
         };
-        step.lane_change_m
+        step.lane_change.map(|jump| jump.left_m)
     }
 
     /// By how much the mirror that `out` describes is not where SUMO has it.

@@ -25,17 +25,11 @@ const STRAIGHT_RAD: f64 = 0.005;
 /// What is averaged: position of the front bumper (metres), heading without jumps and slope (radians), speed (m/s).
 type Sample = [f64; 6];
 
-/// One SUMO step of the mean.
+/// How the path moves in a SUMO step beside the mean's own motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WindowStep {
-    /// The mean before the step. A lane change in the step counts as made long ago.
-    pub before: TrafficState,
-    /// The mean after the step.
-    pub now: TrafficState,
-    /// How far to the left the lane change in this step leads, metres.
-    pub lane_change_m: Option<f64>,
-    /// The same as a vector, world frame.
-    pub shift_m: [f64; 2],
+    /// A lane change in this step. It counts as made long ago: the whole path moves with it.
+    pub lane_change: Option<LaneJump>,
 }
 
 /// The last states of a road user.
@@ -66,8 +60,14 @@ impl StateWindow {
         }
     }
 
-    /// Begins with a road user that has come to `now` straight ahead at its speed, in steps of `step_s`. Returns the mean.
-    pub fn restart(&mut self, now: &TrafficState, step_s: f64) -> TrafficState {
+    /// The mean; what cannot be averaged is that of the newest state.
+    #[must_use]
+    pub fn mean(&self) -> &TrafficState {
+        &self.mean
+    }
+
+    /// Begins with a road user that has come to `now` straight ahead at its speed, in steps of `step_s`.
+    pub fn restart(&mut self, now: &TrafficState, step_s: f64) {
         let newest = sample(now);
         let (sin, cos) = libm::sincos(newest[3]);
         let climb = libm::tan(newest[4]);
@@ -87,8 +87,7 @@ impl StateWindow {
                 *total += part;
             }
         }
-        self.mean = self.mean_of_samples();
-        self.mean
+        self.update_mean();
     }
 
     /// Prefetches what the next state needs.
@@ -113,10 +112,7 @@ impl StateWindow {
             for (axis, part) in vector_m.into_iter().enumerate() {
                 self.sum[axis] += count * part;
             }
-            self.mean.front_x_m += vector_m[0];
-            self.mean.front_y_m += vector_m[1];
         }
-        let before = self.mean;
         let count = self.samples.len();
         let last_yaw_rad = self.samples[(self.oldest + count - 1) % count][3];
         let mut next = sample(now);
@@ -128,13 +124,8 @@ impl StateWindow {
         self.lamps[self.oldest] = now.signals;
         self.oldest = (self.oldest + 1) % count;
         self.newest = *now;
-        self.mean = self.mean_of_samples();
-        Some(WindowStep {
-            before,
-            now: self.mean,
-            lane_change_m: jump.map(|jump| jump.left_m),
-            shift_m: jump.map_or([0.0; 2], |jump| jump.vector_m),
-        })
+        self.update_mean();
+        Some(WindowStep { lane_change: jump })
     }
 
     /// Distance of the mean from SUMO's own path, the lines between the states in the middle of the window, metres. Zero where the path
@@ -160,11 +151,11 @@ impl StateWindow {
             .fold(f64::INFINITY, f64::min)
     }
 
-    fn mean_of_samples(&self) -> TrafficState {
+    fn update_mean(&mut self) {
         let sum = &self.sum;
         let count = self.samples.len();
         let share = 1.0 / count as f64;
-        TrafficState {
+        self.mean = TrafficState {
             front_x_m: sum[0] * share,
             front_y_m: sum[1] * share,
             front_z_m: sum[2] * share,
@@ -174,7 +165,7 @@ impl StateWindow {
             // Lamps are as late as the vehicle: they are those of the middle.
             signals: self.lamps[(self.oldest + (count - 1) / 2) % count],
             ..self.newest
-        }
+        };
     }
 }
 
@@ -225,13 +216,14 @@ mod tests {
             let (sin, cos) = libm::sincos(yaw_rad);
             let at = |step: f64| state(speed_mps * step * STEP_S * cos, speed_mps * step * STEP_S * sin, yaw_rad, speed_mps);
             let mut window = StateWindow::new(10);
-            let mut mean = window.restart(&at(0.0), STEP_S);
+            window.restart(&at(0.0), STEP_S);
             for step in 0..40 {
+                let mean = window.mean();
                 let expected = at(f64::from(step) - 4.5);
                 let off = (mean.front_x_m - expected.front_x_m).hypot(mean.front_y_m - expected.front_y_m);
                 prop_assert!(off < 1e-5 * speed_mps, "step {}: {} m", step, off);
                 prop_assert!(window.deviation_m() < 1e-4);
-                mean = window.advance(&at(f64::from(step) + 1.0), LENGTH_M, STEP_S).unwrap().now;
+                window.advance(&at(f64::from(step) + 1.0), LENGTH_M, STEP_S).unwrap();
             }
         }
     }
@@ -242,15 +234,17 @@ mod tests {
         window.restart(&state(0.0, 0.0, 0.0, 20.0), STEP_S);
         for step in 1..30 {
             let y_m = if step >= 5 { 3.2 } else { 0.0 };
+            let before_m = window.mean().front_y_m;
             let found = window
                 .advance(&state(2.0 * f64::from(step), y_m, 0.0, 20.0), LENGTH_M, STEP_S)
                 .unwrap();
-            let change_m = found.lane_change_m.unwrap_or(0.0);
+            let change_m = found.lane_change.map_or(0.0, |jump| jump.left_m);
+            let shift_m = found.lane_change.map_or(0.0, |jump| jump.vector_m[1]);
             assert!(
                 (change_m - if step == 5 { 3.2 } else { 0.0 }).abs() < 1e-9,
                 "step {step}"
             );
-            let sideways = [found.before.front_y_m, found.now.front_y_m];
+            let sideways = [before_m + shift_m, window.mean().front_y_m];
             assert!(
                 sideways.iter().all(|y| (y - y_m).abs() < 1e-9),
                 "step {step}: {sideways:?}"
@@ -275,10 +269,12 @@ mod tests {
             )
         };
         let mut window = StateWindow::new(10);
-        let mut mean = window.restart(&at(0), STEP_S);
+        window.restart(&at(0), STEP_S);
+        let mut mean = *window.mean();
         let (mut chord, mut accel): (Option<[f64; 2]>, Option<[f64; 2]>) = (None, None);
         for step in 1..70 {
-            let next = window.advance(&at(step), LENGTH_M, STEP_S).unwrap().now;
+            window.advance(&at(step), LENGTH_M, STEP_S).unwrap();
+            let next = *window.mean();
             let now = [
                 (next.front_x_m - mean.front_x_m) / STEP_S,
                 (next.front_y_m - mean.front_y_m) / STEP_S,
