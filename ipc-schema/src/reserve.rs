@@ -271,18 +271,19 @@ impl MessagePages {
     /// Allocates the first `messages`, as far as memory is reserved for them.
     fn allocate_up_to(&self, messages: u64) -> Result<(), ReserveError> {
         let messages = messages.min(self.most);
-        let full = |error| match error {
-            Errno::NOSPC => ReserveError::Full {
-                what: self.channel.name(),
-                needed_bytes: messages * self.stride,
-                free_bytes: free_bytes(),
-            },
-            error => failed(&self.path, error),
-        };
         let allocated = self.allocated.load(Ordering::Relaxed);
         if messages <= allocated {
             return Ok(());
         }
+        let needed_bytes = (messages - allocated) * message_bytes(self.payload_bytes);
+        let full = |error| match error {
+            Errno::NOSPC => ReserveError::Full {
+                what: self.channel.name(),
+                needed_bytes,
+                free_bytes: free_bytes(),
+            },
+            error => failed(&self.path, error),
+        };
         // The headers of a message lie before its payload: the allocation of one begins where the payload of the one before ends.
         let start = (allocated == 0).then_some((0, self.first.1));
         let ranges = (allocated..messages)
@@ -290,7 +291,6 @@ impl MessagePages {
             .map(|payload| (payload.saturating_sub(HEADER_BYTES), HEADER_BYTES + self.payload_bytes))
             .chain(start)
             .filter(|(offset, _)| *offset < self.size);
-        let needed_bytes = (messages - allocated) * message_bytes(self.payload_bytes);
         let _held = take(&self.memory, needed_bytes).map_err(full)?;
         for (offset, bytes) in ranges {
             let bytes = bytes.min(self.size - offset);
