@@ -6,7 +6,7 @@ use crate::{
     control::{MAX_SWITCHES, SensorSwitchLayout},
     ego::EgoPoseLayout,
     event::CollisionLayout,
-    image::{ImageLayout, ImagePlane, MOST_SEEN},
+    image::{ImageLayout, ImagePlane, MOST_SEEN, most_events},
     lane_position::LanePositionLayout,
     neighbours::NeighboursLayout,
     observation::ObservationLayout,
@@ -373,7 +373,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
     ChannelSpec {
         channel: Channel::Image,
         name: "image",
-        payload: "`ImageHead`, planes, `[SeenObject]`: one message for each camera and image",
+        payload: "`ImageHead`, planes, `[SeenObject]`, `[BrightnessEvent]`: one message for each camera and image",
         sections: ImageLayout::SECTIONS,
         dimensions: ImageLayout::DIMENSIONS,
         producer: SensorDaemon,
@@ -383,8 +383,10 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         topics: &[],
         when_full: FullQueue::DropOldest,
         max_payload: |run| {
-            let planes = of_units(run, SensorKind::Camera, |config| ImagePlane::bytes(&config.camera));
-            ImageLayout::new(MOST_SEEN, planes).len
+            of_units(run, SensorKind::Camera, |config| {
+                let camera = &config.camera;
+                ImageLayout::new(MOST_SEEN, ImagePlane::bytes(camera), most_events(camera)).len
+            })
         },
         // The messages of one tick.
         queue_length: |run| run.messages_per_tick(SensorKind::Camera) + SPARE_MESSAGES,

@@ -1,7 +1,7 @@
 //! `image`: one image of one camera.
 //!
 //! One message for each camera and each image. The payload is one [`ImageHead`], the planes
-//! that the configuration wants, and the road users in the image.
+//! that the configuration wants, the road users in the image, and the events of a dynamic vision sensor.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -11,6 +11,8 @@ use crate::{config::CameraConfig, section::payload_layout};
 pub const SKY_INSTANCE: u32 = u32::MAX - 1;
 /// Most road users that an image lists: the first of them.
 pub const MOST_SEEN: usize = 512;
+/// Most events of an image for each of its pixels: the first of them.
+pub const EVENTS_PER_PIXEL: usize = 2;
 
 /// A plane of an image: one value for each pixel, row by row from the upper left corner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,11 +29,24 @@ pub enum ImagePlane {
     Rgb = 3,
     /// `u8`: 255 on road users and props of interest, else 0.
     Binary = 4,
+    /// `u16`: apparent temperature in the thermal infrared (8 to 14 µm), hundredths of a kelvin.
+    Infrared = 5,
+    /// `f32 [2]`: optical flow, pixels to the right and down: how far what the pixel shows has moved in the image within
+    /// `camera.period_s`. Not a number where it was not in front of the camera then.
+    Flow = 6,
 }
 
 impl ImagePlane {
-    /// Every plane, in the order in which a message has them.
-    pub const ALL: [Self; 5] = [Self::Depth, Self::Instance, Self::Semantic, Self::Rgb, Self::Binary];
+    /// Every plane, in the order in which a message has them: those with the widest numbers come first, so that all are aligned.
+    pub const ALL: [Self; 7] = [
+        Self::Depth,
+        Self::Instance,
+        Self::Flow,
+        Self::Infrared,
+        Self::Semantic,
+        Self::Rgb,
+        Self::Binary,
+    ];
 
     /// Bit in [`ImageHead::planes`].
     #[must_use]
@@ -46,21 +61,30 @@ impl ImagePlane {
             Self::Depth | Self::Instance => 4,
             Self::Semantic | Self::Binary => 1,
             Self::Rgb => 3,
+            Self::Infrared => 2,
+            Self::Flow => 8,
+        }
+    }
+
+    /// True if a configuration wants it.
+    #[must_use]
+    pub const fn is_wanted(self, camera: &CameraConfig) -> bool {
+        match self {
+            Self::Depth => camera.depth,
+            Self::Instance => camera.instance,
+            Self::Semantic => camera.semantic,
+            Self::Rgb => camera.rgb,
+            Self::Binary => camera.binary,
+            Self::Infrared => camera.infrared,
+            Self::Flow => camera.flow,
         }
     }
 
     /// Bits of the planes that a configuration wants.
     #[must_use]
     pub fn wanted(camera: &CameraConfig) -> u32 {
-        let wants = [
-            camera.depth,
-            camera.instance,
-            camera.semantic,
-            camera.rgb,
-            camera.binary,
-        ];
-        let wanted = Self::ALL.into_iter().zip(wants).filter(|(_, is_wanted)| *is_wanted);
-        wanted.fold(0, |bits, (plane, _)| bits | plane.bit())
+        let wanted = Self::ALL.into_iter().filter(|plane| plane.is_wanted(camera));
+        wanted.fold(0, |bits, plane| bits | plane.bit())
     }
 
     /// Bytes of all planes of an image.
@@ -69,6 +93,16 @@ impl ImagePlane {
         let wanted = Self::wanted(camera);
         let of_pixel = Self::ALL.into_iter().filter(|plane| plane.bit() & wanted != 0);
         of_pixel.map(Self::pixel_bytes).sum::<usize>() * camera.pixels()
+    }
+}
+
+/// Most events of an image of this camera.
+#[must_use]
+pub fn most_events(camera: &CameraConfig) -> usize {
+    if camera.events {
+        EVENTS_PER_PIXEL * camera.pixels()
+    } else {
+        0
     }
 }
 
@@ -96,8 +130,8 @@ pub struct ImageHead {
     pub range_m: f32,
     /// Number of the camera among those of the run ([`crate::config::SensorUnit`]).
     pub sensor: u32,
-    /// Zero.
-    pub reserved: u32,
+    /// Events that the message has no room for: the last of the tick.
+    pub lost_events: u32,
 }
 
 /// A road user of which an image shows a pixel at least, with the fields of KITTI's labels.
@@ -120,22 +154,38 @@ pub struct SeenObject {
     pub depth_m: [f32; 2],
 }
 
+/// An event of a dynamic vision sensor: the brightness of a pixel has changed by `camera.event_threshold`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
+pub struct BrightnessEvent {
+    /// Since the begin of the tick, microseconds.
+    pub time_us: u32,
+    /// Column.
+    pub x: u16,
+    /// Row.
+    pub y: u16,
+    /// 1 brighter, −1 darker.
+    pub polarity: i32,
+}
+
 payload_layout! {
     /// Layout of an `image` message.
-    ImageLayout(object_count, images, plane_bytes) {
+    ImageLayout(object_count, images, plane_bytes, event_count) {
         /// `ImageHead [1]`.
         head: ImageHead, [images];
         /// The planes, one after the other.
         planes: u8, [plane_bytes];
         /// `SeenObject [count]`.
         objects: SeenObject, [object_count];
+        /// `BrightnessEvent [count]`, in the order of time, row and column.
+        events: BrightnessEvent, [event_count];
     }
 }
 
 impl ImageLayout {
-    /// Layout for `objects` road users and `plane_bytes` bytes of planes.
+    /// Layout for `objects` road users, `plane_bytes` bytes of planes and `events` events.
     #[must_use]
-    pub fn new(objects: usize, plane_bytes: usize) -> Self {
-        Self::sized(objects, 1, plane_bytes)
+    pub fn new(objects: usize, plane_bytes: usize, events: usize) -> Self {
+        Self::sized(objects, 1, plane_bytes, events)
     }
 }

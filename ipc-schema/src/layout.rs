@@ -16,7 +16,7 @@ use crate::{
     event::Collision,
     field::FIELDS,
     header::MessageHeader,
-    image::{ImageHead, SeenObject},
+    image::{BrightnessEvent, ImageHead, SeenObject},
     lane_position::LanePosition,
     pointcloud::{LidarPoint, Scan},
     radar::{RadarDetection, RadarScan},
@@ -248,7 +248,13 @@ pub fn table() -> Vec<TypeLayout> {
             focal_px,
             range_m,
             sensor,
-            reserved
+            lost_events
+        }),
+        layout!(BrightnessEvent {
+            time_us,
+            x,
+            y,
+            polarity
         }),
         layout!(SeenObject {
             object,
@@ -372,6 +378,7 @@ macro_rules! records {
 records!(
     ImageHead,
     SeenObject,
+    BrightnessEvent,
     RadarScan,
     RadarDetection,
     Collision,

@@ -14,7 +14,7 @@
 //! | `event` | `[Collision]` | sim-core | none |
 //! | `pointcloud` | `Scan`, `[LidarPoint]`: one message for each LIDAR and tick | sensor-daemon | none |
 //! | `switch` | `[SensorSwitch]`, from the tick in the header on | traffic-bridge | none |
-//! | `image` | `ImageHead`, planes, `[SeenObject]`: one message for each camera and image | sensor-daemon | none |
+//! | `image` | `ImageHead`, planes, `[SeenObject]`, `[BrightnessEvent]`: one message for each camera and image | sensor-daemon | none |
 //! | `radar` | `RadarScan`, `[RadarDetection]`: one message for each radar and scan | sensor-daemon | none |
 //! | `lane-position` | SUMO's time, `[LanePosition]` | traffic-bridge | none |
 //! | `control` | [`control::ControlRequest`] → [`control::ControlReply`] | supervisor | traffic-bridge |
@@ -77,4 +77,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 22;
+pub const SCHEMA_VERSION: u32 = 23;

@@ -1,14 +1,19 @@
 //! Cameras in a run: publishes the images of every carrier, and counts and hashes them.
 
-use std::{collections::BTreeMap, mem::offset_of, sync::Arc};
+use std::{
+    collections::{BTreeMap, VecDeque},
+    mem::offset_of,
+    sync::Arc,
+};
 
 use ipc_schema::{
     block,
     config::{BlackoutPolicy, Config, OWN_SENSOR},
     failure::{Failure, FailureKind},
     header::MessageHeader,
-    image::{ImageHead, ImageLayout, ImagePlane, MOST_SEEN, SeenObject},
+    image::{BrightnessEvent, ImageHead, ImageLayout, ImagePlane, MOST_SEEN, SeenObject, most_events},
     observation::EMPTY_SLOT,
+    pointcloud::ROADSIDE_CARRIER,
     ports::Publisher,
     sensor::SensorKind,
     world::{SubStep, VehicleState},
@@ -20,7 +25,10 @@ use crate::{
     roadside::RoadsideCarriers,
     sensing::Sensing,
     sensors::{
-        camera::{CameraModel, CameraParams, CameraScratch, CameraTargets, ImagePlanes, SightScene},
+        camera::{
+            CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, EventMemory, ImagePlanes,
+            PastPoses, SampledSpan, SightScene, sort_events,
+        },
         lidar::Targets,
     },
 };
@@ -58,6 +66,8 @@ pub struct CameraImaging {
     seen: CameraTargets,
     scratch: CameraScratch,
     objects: Vec<SeenObject>,
+    past: PastTicks,
+    vision: EventVision,
     due: Vec<DueUnit>,
     publisher: Publisher,
     /// Images that stand in observations; `None` where none do.
@@ -72,6 +82,130 @@ struct NumberedCamera {
     planes: u32,
     range_m: f32,
     plane_bytes: usize,
+    /// Ticks since which the optical flow counts; 0 without it.
+    flow_ticks: u64,
+    /// Change of brightness that is an event, and most events of an image; `None` without events.
+    events: Option<(f32, usize)>,
+}
+
+/// Poses of the last ticks of an episode, for the optical flow.
+#[derive(Default)]
+struct PastTicks {
+    /// Most that are kept.
+    most: usize,
+    /// Episode, tick and poses, the oldest first.
+    ticks: VecDeque<(u64, u64, PastPoses)>,
+}
+
+impl PastTicks {
+    /// The poses so many ticks before a tick; `None` if its episode had not begun.
+    fn before(&self, header: &MessageHeader, ticks: u64) -> Option<&PastPoses> {
+        let wanted = (header.episode, header.tick.checked_sub(ticks)?);
+        let mut known = self.ticks.iter();
+        known
+            .find(|(episode, tick, _)| (*episode, *tick) == wanted)
+            .map(|(.., poses)| poses)
+    }
+
+    /// The camera and the road users at the time since which its optical flow counts.
+    fn since(
+        &self,
+        header: &MessageHeader,
+        numbered: &NumberedCamera,
+        camera: &CameraModel,
+        carrier: &VehicleState,
+        now: &CameraPose,
+    ) -> Option<(CameraPose, &PastPoses)> {
+        if numbered.flow_ticks == 0 {
+            return None;
+        }
+        let poses = self.before(header, numbered.flow_ticks)?;
+        let pose = match carrier.vehicle & ROADSIDE_CARRIER {
+            0 => camera.past_pose_on(carrier.vehicle, poses)?,
+            // It stands still.
+            _ => *now,
+        };
+        Some((pose, poses))
+    }
+
+    /// Adds the poses of a tick.
+    fn record(&mut self, header: &MessageHeader, targets: &Targets) {
+        let mut poses = PastPoses::default();
+        if self.ticks.len() >= self.most
+            && let Some((.., oldest)) = self.ticks.pop_front()
+        {
+            poses = oldest;
+        }
+        poses.record(targets);
+        self.ticks.push_back((header.episode, header.tick, poses));
+    }
+}
+
+/// The dynamic vision sensors of a run: they sample within the tick.
+#[derive(Default)]
+struct EventVision {
+    /// Length of a sub-step, microseconds.
+    sub_step_us: f64,
+    sub_steps: usize,
+    /// The road users at the end of each sub-step of the tick that `targets` are of.
+    within: Vec<CameraTargets>,
+    /// By carrier and number of the camera, with the tick of the last sample.
+    memories: BTreeMap<(u64, u32, u32), (u64, EventMemory)>,
+    brightness: Vec<f32>,
+    events: Vec<BrightnessEvent>,
+}
+
+impl EventVision {
+    /// The road users within a tick.
+    fn begin_tick(&mut self, header: &MessageHeader, targets: &Targets) {
+        self.within.resize_with(self.sub_steps, CameraTargets::default);
+        for (sub_step, within) in self.within.iter_mut().enumerate() {
+            within.update_within(targets, sub_step);
+        }
+        // A camera that has missed a tick begins again.
+        self.memories.retain(|_, (tick, _)| *tick + 1 == header.tick);
+    }
+
+    /// Events of a tick of one camera.
+    fn sample(
+        &mut self,
+        header: &MessageHeader,
+        camera: &CameraModel,
+        targets: &Targets,
+        (vehicle, unit): (u32, &DueUnit),
+        threshold: f32,
+        scratch: &mut CameraScratch,
+    ) {
+        self.events.clear();
+        let [width, height] = camera.size();
+        self.brightness.resize(width * height, 0.0);
+        let key = (header.episode, vehicle, unit.sensor);
+        let (tick, memory) = self.memories.entry(key).or_default();
+        *tick = header.tick;
+        let mut objects = Vec::new();
+        for (sub_step, within) in self.within.iter().enumerate() {
+            let Some(pose) = camera.pose_within(targets, unit.row, sub_step) else {
+                return;
+            };
+            let shot = CameraShot {
+                targets: within,
+                carrier: Some(unit.row),
+                pose,
+                past: None,
+            };
+            let mut planes = ImagePlanes {
+                brightness: &mut self.brightness,
+                ..ImagePlanes::default()
+            };
+            camera.take(&shot, scratch, &mut planes, &mut objects);
+            let span = SampledSpan {
+                begin_us: self.sub_step_us * sub_step as f64,
+                length_us: self.sub_step_us,
+            };
+            memory.sample(&self.brightness, width, threshold, span, &mut self.events);
+        }
+        sort_events(&mut self.events);
+    }
 }
 
 /// The newest image of each slot that carries a camera, as the observation has them.
@@ -115,7 +249,7 @@ impl ObservedImages {
             ImagePlane::Rgb => bytemuck::cast_slice(planes.rgb),
             ImagePlane::Binary => planes.binary,
             // No configuration observes these.
-            ImagePlane::Depth | ImagePlane::Instance => return,
+            ImagePlane::Depth | ImagePlane::Instance | ImagePlane::Infrared | ImagePlane::Flow => return,
         };
         let first = slot * self.image_bytes;
         if let Some(place) = self.newest.get_mut(first..first + self.image_bytes) {
@@ -150,15 +284,34 @@ impl CameraImaging {
                 planes: ImagePlane::wanted(&camera),
                 range_m: camera.range_m as f32,
                 plane_bytes: ImagePlane::bytes(&camera),
+                flow_ticks: if camera.flow { u64::from(unit.period_ticks) } else { 0 },
+                events: camera
+                    .events
+                    .then(|| (camera.event_threshold as f32, most_events(&camera))),
             };
             (unit.sensor, camera)
         });
+        let cameras: BTreeMap<u32, NumberedCamera> = cameras.collect();
+        let most = cameras.values().map(|camera| camera.flow_ticks).max().unwrap_or(0) as usize;
+        let sub_steps = match cameras.values().any(|camera| camera.events.is_some()) {
+            true => config.run.sub_steps as usize,
+            false => 0,
+        };
         Self {
-            cameras: cameras.collect(),
+            cameras,
             targets: Targets::default(),
             seen: CameraTargets::default(),
             scratch: CameraScratch::default(),
             objects: Vec::new(),
+            past: PastTicks {
+                most,
+                ticks: VecDeque::new(),
+            },
+            vision: EventVision {
+                sub_step_us: 1e6 * config.run.tick_s / f64::from(config.run.sub_steps),
+                sub_steps,
+                ..EventVision::default()
+            },
             due: Vec::new(),
             publisher,
             observed: ObservedImages::new(config),
@@ -185,6 +338,7 @@ impl CameraImaging {
         &mut self,
         header: &MessageHeader,
         states: &[VehicleState],
+        sub_steps: &[SubStep],
         beside: &RoadsideCarriers,
         sensing: &Sensing,
     ) -> Result<(), Failure> {
@@ -194,10 +348,14 @@ impl CameraImaging {
         let mut due = std::mem::take(&mut self.due);
         sensing.units_due(SensorKind::Camera, &mut due);
         beside.add_due(SensorKind::Camera, sensing.now(header).tick, states.len(), &mut due);
+        // The optical flow of a later image needs the poses of this tick, whether a camera is due or not.
+        let keeps_poses = self.past.most > 0;
+        if !due.is_empty() || keeps_poses {
+            self.targets.update(states, sub_steps, self.vision.sub_steps);
+        }
         if !due.is_empty() {
-            let steps: &[SubStep] = &[];
-            self.targets.update(states, steps, 0);
             self.seen.update(&self.targets);
+            self.vision.begin_tick(header, &self.targets);
             self.targets.add_fixed(beside.states());
         }
         for unit in &due {
@@ -207,6 +365,9 @@ impl CameraImaging {
             if let Some(carrier) = carrier {
                 self.take_one(header, carrier, unit)?;
             }
+        }
+        if keeps_poses {
+            self.past.record(header, &self.targets);
         }
         self.due = due;
         Ok(())
@@ -227,20 +388,38 @@ impl CameraImaging {
         let Some(pose) = camera.pose_on(&self.targets, unit.row) else {
             return Ok(());
         };
-        let layout = ImageLayout::new(MOST_SEEN, numbered.plane_bytes);
-        let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
-        let sections = [layout.head, layout.planes, layout.objects];
-        let [head, planes, listed] = block::split_mut(draft.payload_mut(), &sections).map_err(unreadable)?;
+        let most_events = numbered.events.map_or(0, |(_, most)| most);
+        let longest = ImageLayout::new(MOST_SEEN, numbered.plane_bytes, most_events);
+        let mut draft = self.publisher.loan_unwritten(*header, longest.len)?;
+        // Head and planes lie at the same place whatever follows them.
+        let [planes] = block::split_mut(draft.payload_mut(), &[longest.planes]).map_err(unreadable)?;
         let [width, height] = camera.size();
         let mut planes_of = split_planes(planes, numbered.planes, width * height);
         let (seen, scratch) = (&self.seen, &mut self.scratch);
-        camera.take(seen, Some(unit.row), &pose, scratch, &mut planes_of, &mut self.objects);
+        let shot = CameraShot {
+            targets: seen,
+            carrier: Some(unit.row),
+            pose,
+            past: self.past.since(header, numbered, camera, carrier, &pose),
+        };
+        camera.take(&shot, scratch, &mut planes_of, &mut self.objects);
         if let (Some(observed), Some(slot), OWN_SENSOR) = (&mut self.observed, unit.slot, unit.sensor) {
             observed.keep(slot, &planes_of);
         }
         self.objects.truncate(MOST_SEEN);
-        let objects: &[u8] = bytemuck::cast_slice(&self.objects);
-        listed[..objects.len()].copy_from_slice(objects);
+        let vision = &mut self.vision;
+        vision.events.clear();
+        if let Some((threshold, _)) = numbered.events {
+            let carried = (carrier.vehicle, unit);
+            vision.sample(header, camera, &self.targets, carried, threshold, scratch);
+        }
+        let lost_events = vision.events.len().saturating_sub(most_events);
+        vision.events.truncate(most_events);
+        let layout = ImageLayout::new(self.objects.len(), numbered.plane_bytes, vision.events.len());
+        let sections = [layout.head, layout.planes, layout.objects, layout.events];
+        let [head, planes, objects, events] = block::split_mut(draft.payload_mut(), &sections).map_err(unreadable)?;
+        objects.copy_from_slice(bytemuck::cast_slice(&self.objects));
+        events.copy_from_slice(bytemuck::cast_slice(&vision.events));
         head.copy_from_slice(bytemuck::bytes_of(&ImageHead {
             position_m: pose.position_m(),
             attitude_rad: pose.attitude_rad(),
@@ -252,13 +431,13 @@ impl CameraImaging {
             focal_px: camera.focal_px() as f32,
             range_m: numbered.range_m,
             sensor: unit.sensor,
-            reserved: 0,
+            lost_events: lost_events as u32,
         }));
         let hashed = hashed_head(head, offset_of!(ImageHead, sensor), unit.sensor);
         self.totals
-            .add(header.tick, self.objects.len(), &[hashed, planes, objects]);
+            .add(header.tick, self.objects.len(), &[hashed, planes, objects, events]);
         *draft.header_mut() = MessageHeader {
-            shape: ImageLayout::new(self.objects.len(), numbered.plane_bytes).shape,
+            shape: layout.shape,
             ..*header
         };
         draft.send()?;
@@ -284,13 +463,16 @@ fn split_planes(mut bytes: &mut [u8], wanted: u32, pixels: usize) -> ImagePlanes
         bytes = rest;
         first
     });
-    let [depth, instance, semantic, rgb, binary] = of_plane.each_mut().map(std::mem::take);
+    let [depth, instance, flow, infrared, semantic, rgb, binary] = of_plane.each_mut().map(std::mem::take);
     ImagePlanes {
         depth_m: bytemuck::cast_slice_mut(depth),
         instance: bytemuck::cast_slice_mut(instance),
         semantic,
         rgb: bytemuck::cast_slice_mut(rgb),
         binary,
+        infrared: bytemuck::cast_slice_mut(infrared),
+        flow_px: bytemuck::cast_slice_mut(flow),
+        brightness: &mut [],
     }
 }
 
@@ -314,8 +496,22 @@ mod tests {
             planes.semantic.len(),
             planes.rgb.len(),
             planes.binary.len(),
+            planes.infrared.len(),
+            planes.flow_px.len(),
         ];
-        assert_eq!(lengths, [6, 0, 6, 6, 0]);
+        assert_eq!(lengths, [6, 0, 6, 6, 0, 0, 0]);
+    }
+
+    #[test]
+    fn all_planes_of_an_odd_number_of_pixels_are_aligned() {
+        let mut words = [0_u64; 32];
+        let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+        let wanted = ImagePlane::ALL.into_iter().fold(0, |bits, plane| bits | plane.bit());
+        let planes = split_planes(bytes, wanted, 3);
+        assert_eq!(
+            (planes.infrared.len(), planes.flow_px.len(), planes.binary.len()),
+            (3, 3, 3)
+        );
     }
 
     #[test]

@@ -112,7 +112,7 @@ impl Surroundings {
             ultrasonic.sample(header, road_users.states, sensing);
         }
         if let Some(cameras) = &mut self.cameras {
-            cameras.take(header, road_users.states, &self.beside, sensing)?;
+            cameras.take(header, road_users.states, road_users.sub_steps, &self.beside, sensing)?;
         }
         if let Some(radars) = &mut self.radars {
             radars.scan(header, road_users.states, &self.beside, sensing)?;

@@ -25,7 +25,7 @@ impl SightMessage {
         let sections: Vec<Section> = match channel {
             Channel::Image => {
                 let layout = ImageLayout::of(&header);
-                vec![layout.head, layout.planes, layout.objects]
+                vec![layout.head, layout.planes, layout.objects, layout.events]
             }
             Channel::LanePosition => {
                 let layout = LanePositionLayout::of(&header);

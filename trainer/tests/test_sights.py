@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from caraware.ipc.image import IMAGE, PLANES, SEEN, split_planes
+from caraware.ipc.image import EVENT, IMAGE, PLANES, SEEN, split_planes
 from caraware.ipc.radar import DETECTION, RADAR_SCAN
 
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
@@ -13,7 +13,13 @@ LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 
 @pytest.mark.parametrize(
     ("name", "dtype"),
-    [("ImageHead", IMAGE), ("SeenObject", SEEN), ("RadarScan", RADAR_SCAN), ("RadarDetection", DETECTION)],
+    [
+        ("ImageHead", IMAGE),
+        ("SeenObject", SEEN),
+        ("BrightnessEvent", EVENT),
+        ("RadarScan", RADAR_SCAN),
+        ("RadarDetection", DETECTION),
+    ],
 )
 def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
     table = {row["name"]: row for row in json.loads(LAYOUT.read_text())["types"]}
@@ -22,18 +28,18 @@ def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
     assert [[field, dtype.fields[field][1]] for field in dtype.names] == [field[:2] for field in table[name]["fields"]]
 
 
-@pytest.mark.parametrize("wanted", [0b00000, 0b00101, 0b11010, 0b11111])
+@pytest.mark.parametrize("wanted", [0b0000000, 0b0000101, 0b1011010, 0b0110001, 0b1111111])
 def test_planes_follow_one_another(wanted: int) -> None:
     generator = np.random.default_rng(wanted)
     head = np.zeros(1, IMAGE)
     head["height"], head["width"], head["planes"] = 3, 5, wanted
     planes = {
         name: generator.integers(0, 255, (3, 5, *shape)).astype(scalar)
-        for bit, (name, scalar, shape) in enumerate(PLANES)
+        for name, bit, scalar, shape in PLANES
         if wanted >> bit & 1
     }
     found = split_planes(head[0], b"".join(plane.tobytes() for plane in planes.values()))
-    assert set(found) == {name for name, _, _ in PLANES}
+    assert set(found) == {name for name, *_ in PLANES}
     for name, plane in found.items():
         if name in planes:
             assert plane is not None

@@ -33,6 +33,14 @@ pub struct CameraConfig {
     pub rgb: bool,
     /// Images have what is of interest in white.
     pub binary: bool,
+    /// Images have apparent temperatures.
+    pub infrared: bool,
+    /// Images have the optical flow.
+    pub flow: bool,
+    /// Images have the events of a dynamic vision sensor.
+    pub events: bool,
+    /// Change of the logarithm of the brightness of a pixel that is an event.
+    pub event_threshold: f64,
     /// The plane that observations have of each image.
     pub observed: ObservedPlane,
     /// Length of a blackout, shortest and longest, seconds; [0, 0] = none.

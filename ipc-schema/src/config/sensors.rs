@@ -304,6 +304,8 @@ pub struct WeatherConfig {
     pub sun_azimuth_deg: f64,
     /// Sunlight: 0 = overcast or night, 1 = clear sky.
     pub sunlight: f64,
+    /// Temperature of the air, degrees Celsius: what thermal images show is relative to it.
+    pub air_temperature_c: f64,
 }
 
 #[cfg(test)]

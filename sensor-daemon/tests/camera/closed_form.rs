@@ -104,6 +104,53 @@ fn fog_whitens_what_is_far_and_night_darkens_all() {
 }
 
 #[test]
+fn thermal_images_show_warm_bodies_a_cold_sky_and_the_air_in_fog() {
+    let person = VehicleState {
+        length_m: 0.5,
+        width_m: 0.5,
+        height_m: 1.7,
+        kind: Kind::Person as u32,
+        ..car(2, 12.0, 0.0, 0.0)
+    };
+    let states = [car(0, 0.0, 0.0, 0.0), car(1, 12.0, 6.0, 0.0), person];
+    let kelvin = |visibility_m: f64, sunlight: f64| {
+        let mut config = config();
+        config.weather.air_temperature_c = 10.0;
+        config.weather.visibility_m = visibility_m;
+        (config.weather.sunlight, config.weather.sun_elevation_deg) = (sunlight, 40.0);
+        let camera = CameraModel::new(
+            &params(100, 100, [2.0, 0.0, 1.5, 0.0, 0.0, 0.0]),
+            &config,
+            &scene_of(Vec::new()),
+        );
+        let (taken, _) = take(&camera, &states, 0, &mut CameraScratch::default());
+        let of = |instance: u32| {
+            let pixel = taken.instance.iter().position(|found| *found == instance).unwrap();
+            f64::from(taken.infrared[pixel]) / 100.0
+        };
+        [of(SKY_INSTANCE), of(1), of(2), of(GROUND)]
+    };
+    let air_k = 283.15;
+    let [sky, car, person, grass] = kelvin(1e6, 1.0);
+    // Swinbank: 0.0552 · 283.15^1.5 = 263.0 K; 120 m of clear air take a thousandth of the difference.
+    assert!((sky - 263.0).abs() < 0.2, "{sky}");
+    // Half-way between the skin's 306.15 K and the air, of emissivity 0.97.
+    assert!((person - 0.5 * (306.15 + air_k)).abs() < 1.0, "{person}");
+    // 7 K and the sun's 12 K · sin 40° above the air, of emissivity 0.92.
+    assert!((car - (air_k + 7.0 + 12.0 * 0.6428)).abs() < 2.5, "{car}");
+    assert!((grass - (air_k - 1.0 + 6.0 * 0.6428)).abs() < 1.0, "{grass}");
+    let [sky, car, person, grass] = kelvin(1e6, 0.0);
+    assert!(
+        (sky - air_k).abs() < 0.02,
+        "an overcast sky is as warm as the air: {sky}"
+    );
+    assert!(person > car && car > grass && grass < air_k);
+    // Koschmieder in dense fog: at the visibility 2 % of the difference are left.
+    let [_, _, fogged, _] = kelvin(10.0, 0.0);
+    assert!((fogged - air_k - 0.02 * (person - air_k)).abs() < 0.1, "{fogged}");
+}
+
+#[test]
 fn odd_positions_do_no_harm() {
     let scene = scene_of(vec![rectangle([-5.0, 5.0], [-5.0, 5.0], 9.0)]);
     let camera = CameraModel::new(&params(40, 30, [0.0, 0.0, 1.5, 0.1, 0.0, 0.0]), &config(), &scene);

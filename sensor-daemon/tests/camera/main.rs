@@ -9,13 +9,17 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::sensors::{
-    camera::{CameraModel, CameraParams, CameraPose, CameraScratch, CameraTargets, ImagePlanes, SeenObject},
+    camera::{
+        CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, ImagePlanes, PastPoses,
+        SeenObject,
+    },
     lidar::Targets,
 };
 use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
 mod boxes;
 mod closed_form;
+mod flow;
 #[path = "../lidar_city/mod.rs"]
 mod lidar_city;
 mod oracle;
@@ -29,6 +33,9 @@ struct Taken {
     semantic: Vec<u8>,
     rgb: Vec<[u8; 3]>,
     binary: Vec<u8>,
+    infrared: Vec<u16>,
+    flow_px: Vec<[f32; 2]>,
+    brightness: Vec<f32>,
     objects: Vec<SeenObject>,
 }
 
@@ -48,6 +55,24 @@ fn config() -> Config {
 
 /// Takes an image from the road user in `row`.
 fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut CameraScratch) -> (Taken, CameraPose) {
+    take_since(camera, None, states, row, scratch)
+}
+
+/// Takes an image from the road user in `row`, with the optical flow since `before`.
+fn take_since(
+    camera: &CameraModel,
+    before: Option<&[VehicleState]>,
+    states: &[VehicleState],
+    row: usize,
+    scratch: &mut CameraScratch,
+) -> (Taken, CameraPose) {
+    let mut poses = PastPoses::default();
+    if let Some(before) = before {
+        let mut targets = Targets::default();
+        targets.update(before, &[], 0);
+        poses.record(&targets);
+    }
+    let past = camera.past_pose_on(states[row].vehicle, &poses);
     let steps: &[SubStep] = &[];
     let mut targets = Targets::default();
     targets.update(states, steps, 0);
@@ -61,6 +86,9 @@ fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut
         semantic: vec![0; pixels],
         rgb: vec![[0; 3]; pixels],
         binary: vec![0; pixels],
+        infrared: vec![0; pixels],
+        flow_px: vec![[9e9; 2]; pixels],
+        brightness: vec![-1.0; pixels],
         objects: Vec::new(),
     };
     let pose = camera.pose_on(&targets, row).unwrap();
@@ -70,8 +98,22 @@ fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut
         semantic: &mut taken.semantic,
         rgb: &mut taken.rgb,
         binary: &mut taken.binary,
+        infrared: &mut taken.infrared,
+        flow_px: &mut taken.flow_px,
+        brightness: &mut taken.brightness,
     };
-    camera.take(&seen, Some(row), &pose, scratch, &mut planes, &mut taken.objects);
+    let shot = CameraShot {
+        targets: &seen,
+        carrier: Some(row),
+        pose,
+        past: past.map(|pose| (pose, &poses)),
+    };
+    camera.take(&shot, scratch, &mut planes, &mut taken.objects);
+    // Images are compared, and "not a number" differs from itself.
+    let flows = taken.flow_px.iter_mut();
+    flows
+        .filter(|flow| flow.iter().any(|part| part.is_nan()))
+        .for_each(|flow| *flow = flow::UNKNOWN);
     (taken, pose)
 }
 

@@ -5,7 +5,7 @@ use sensor_daemon::sensors::lidar::ScanPath;
 use crate::{
     CameraModel, CameraScratch, Taken, VehicleState, config, lidar_city,
     lidar_city::{Moves, traffic},
-    params, take,
+    params, take_since,
 };
 
 fn busy(path: ScanPath, size: [usize; 2], states: &[VehicleState], scratch: &mut CameraScratch) -> Taken {
@@ -16,7 +16,15 @@ fn busy(path: ScanPath, size: [usize; 2], states: &[VehicleState], scratch: &mut
     let params = params(size[0], size[1], [1.5, 0.0, 1.4, 0.02, -0.03, 0.3]);
     let camera = CameraModel::new(&params, &config, &lidar_city::scene(500, 1)).with_path(path);
     assert!(camera.path() == path);
-    take(&camera, states, 0, scratch).0
+    let before: Vec<_> = states
+        .iter()
+        .map(|state| VehicleState {
+            x_m: state.x_m - state.yaw_rad.cos(),
+            yaw_rad: state.yaw_rad - 0.02,
+            ..*state
+        })
+        .collect();
+    take_since(&camera, Some(&before), states, 0, scratch).0
 }
 
 #[test]

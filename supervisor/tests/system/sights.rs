@@ -1,10 +1,10 @@
 //! Cameras and radars in whole runs: real traffic, real shared memory, messages read from a recording.
 
-use crate::common::{ONE_TICK_AHEAD, Workplace, of_channel, road_users};
+use crate::common::{ONE_TICK_AHEAD, Workplace, of_channel, road_users, text};
 use ipc_schema::{
     block,
     channel::Channel,
-    image::{ImageHead, ImageLayout, ImagePlane, SeenObject},
+    image::{BrightnessEvent, ImageHead, ImageLayout, ImagePlane, SKY_INSTANCE, SeenObject},
     radar::{NO_OBJECT, RadarDetection, RadarLayout, RadarScan},
 };
 use recorder::file::reader::ChannelMessage;
@@ -48,17 +48,21 @@ fn image(message: &ChannelMessage) -> (ImageHead, &[SeenObject], Vec<u32>) {
     (head, objects, instance)
 }
 
-/// Column, row and depth of a point of the world in an image.
-fn projected(head: &ImageHead, point_m: [f64; 3]) -> [f64; 3] {
+/// The axes of a camera in the world: ahead, left, up.
+fn axes(head: &ImageHead) -> [[f64; 3]; 3] {
     let [roll, pitch, yaw] = head.attitude_rad;
     let ((sr, cr), (sp, cp), (sy, cy)) = (roll.sin_cos(), (-pitch).sin_cos(), yaw.sin_cos());
-    let off: [f64; 3] = std::array::from_fn(|i| point_m[i] - head.position_m[i]);
-    let axes = [
+    [
         [cy * cp, sy * cp, -sp],
         [cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr],
         [cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr],
-    ];
-    let [x, y, z] = axes.map(|axis| (0..3).map(|i| axis[i] * off[i]).sum::<f64>());
+    ]
+}
+
+/// Column, row and depth of a point of the world in an image.
+fn projected(head: &ImageHead, point_m: [f64; 3]) -> [f64; 3] {
+    let off: [f64; 3] = std::array::from_fn(|i| point_m[i] - head.position_m[i]);
+    let [x, y, z] = axes(head).map(|axis| (0..3).map(|i| axis[i] * off[i]).sum::<f64>());
     let focal = f64::from(head.focal_px);
     [
         0.5 * f64::from(head.width) - y / x * focal,
@@ -141,4 +145,126 @@ fn images_and_detections_show_the_road_users_of_their_tick_and_are_made_again() 
     }
     assert_eq!(first["observation_hash"], second["observation_hash"]);
     workplace.assert_nothing_left();
+}
+
+/// The head of an image, its optical flow, depths and instances, and its events.
+struct MovingImage<'a> {
+    head: ImageHead,
+    depth_m: Vec<f32>,
+    instance: Vec<u32>,
+    flow_px: Vec<[f32; 2]>,
+    infrared: Vec<u16>,
+    events: &'a [BrightnessEvent],
+}
+
+/// The numbers of a plane.
+fn numbers<T: bytemuck::Pod>(plane: &[u8]) -> Vec<T> {
+    plane
+        .chunks_exact(size_of::<T>())
+        .map(bytemuck::pod_read_unaligned)
+        .collect()
+}
+
+impl<'a> MovingImage<'a> {
+    fn new(message: &'a ChannelMessage) -> Self {
+        let layout = ImageLayout::of(&message.header);
+        let planes: &[u8] = block::view(message.payload(), layout.planes).unwrap();
+        let head = block::view::<ImageHead>(message.payload(), layout.head).unwrap()[0];
+        let pixels = (head.width * head.height) as usize;
+        assert_eq!(planes.len(), 18 * pixels);
+        let part = |first: usize, bytes: usize| &planes[first * pixels..(first + bytes) * pixels];
+        Self {
+            head,
+            depth_m: numbers(part(0, 4)),
+            instance: numbers(part(4, 4)),
+            flow_px: numbers(part(8, 8)),
+            infrared: numbers(part(16, 2)),
+            events: block::view(message.payload(), layout.events).unwrap(),
+        }
+    }
+
+    /// The point of the world that a pixel shows.
+    fn point_m(&self, pixel: usize) -> [f64; 3] {
+        let (width, height) = (self.head.width as usize, self.head.height as usize);
+        let focal = f64::from(self.head.focal_px);
+        let a = (0.5 * width as f64 - (pixel % width) as f64 - 0.5) / focal;
+        let b = (0.5 * height as f64 - (pixel / width) as f64 - 0.5) / focal;
+        let (depth, axes) = (f64::from(self.depth_m[pixel]), axes(&self.head));
+        std::array::from_fn(|i| self.head.position_m[i] + depth * (axes[0][i] + a * axes[1][i] + b * axes[2][i]))
+    }
+}
+
+#[test]
+fn flow_events_and_temperatures_are_those_of_the_traffic_and_are_made_again() {
+    let settings = [
+        "camera.vehicles=3",
+        "camera.semantic=false",
+        "camera.flow=true",
+        "camera.infrared=true",
+        "camera.events=true",
+        ONE_TICK_AHEAD,
+    ];
+    let workplace = Workplace::new();
+    let recording = workplace.record("first", &arguments(&settings), &[Channel::Image]);
+    let mut heads = std::collections::BTreeMap::new();
+    let (mut compared, mut moved, mut events) = (0, 0, 0);
+    for message in of_channel(&recording, Channel::Image) {
+        let image = MovingImage::new(&message);
+        let (tick, vehicle) = (message.header.tick, image.head.vehicle);
+        let width = image.head.width as usize;
+        // The temperatures of 15 °C under an overcast sky.
+        assert!(image.infrared.iter().all(|pixel| (28_500..30_500).contains(pixel)));
+        // Where the still world was in the image before, by that image's own pose.
+        if let Some(before) = heads.get(&(tick.wrapping_sub(1), vehicle)) {
+            for pixel in (0..image.instance.len()).step_by(7) {
+                let flow_px = image.flow_px[pixel].map(f64::from);
+                if image.instance[pixel] < 1 << 31 || image.instance[pixel] == SKY_INSTANCE {
+                    continue;
+                }
+                let [u, v, depth_m] = projected(before, image.point_m(pixel));
+                if depth_m < 0.5 {
+                    continue;
+                }
+                let now = [(pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5];
+                let off = [now[0] - flow_px[0] - u, now[1] - flow_px[1] - v];
+                assert!(off.iter().all(|part| part.abs() < 0.05), "{flow_px:?} {off:?}");
+                compared += 1;
+                moved += u32::from(flow_px[0].hypot(flow_px[1]) > 0.5);
+            }
+        } else if tick == 0 {
+            assert!(image.flow_px.iter().all(|flow| flow.iter().all(|part| part.is_nan())));
+        }
+        let times = image.events.iter().map(|event| event.time_us);
+        assert!(times.is_sorted_by(|a, b| a <= b));
+        for event in image.events {
+            assert!(event.time_us <= 100_000 && event.polarity.abs() == 1);
+            assert!(u32::from(event.x) < image.head.width && u32::from(event.y) < image.head.height);
+        }
+        events += image.events.len();
+        heads.insert((tick, vehicle), image.head);
+    }
+    assert!(
+        compared > 20_000 && moved > 2_000,
+        "{compared} pixels, {moved} of them moved"
+    );
+    assert!(events > 1_000, "only {events} events");
+
+    // The same seed gives the same bytes, with another window too.
+    workplace.succeed(&[&arguments(&settings[..5])[..], &["--name", "second"]].concat());
+    let [first, second] = ["first", "second"].map(|name| workplace.report(name));
+    assert_eq!(first["camera"], second["camera"]);
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_dynamic_vision_sensor_that_misses_ticks_is_refused() {
+    let workplace = Workplace::new();
+    let settings = ["camera.vehicles=1", "camera.events=true", "camera.period_s=0.2"];
+    let output = workplace.run(&arguments(&settings));
+    let text = text(&output);
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(
+        text.contains("`camera` has events, but takes an image every 2 ticks only"),
+        "{text}"
+    );
 }

@@ -9,6 +9,7 @@ use sim_core::scene::{
 };
 
 use super::{
+    flow::{PastPoses, PixelMotion},
     labels::SemanticLabel,
     raster::MOST_EDGES,
     surfaces::{SeenBody, SurfaceTable},
@@ -16,8 +17,9 @@ use super::{
 };
 use crate::sensors::lidar::{
     Targets,
+    sensor::SensorPose,
     solids::{INTEREST, StillSolid, StillSolids},
-    targets::MovingTarget,
+    targets::{MovingTarget, Pose},
 };
 
 /// Most boxes of a road user.
@@ -51,6 +53,7 @@ struct RoadUserBody {
     is_round: bool,
     bounds: BodyBounds,
     body: SeenBody,
+    pose: Pose,
 }
 
 /// The road users of a tick as cameras see them: one value serves all cameras.
@@ -71,7 +74,29 @@ impl CameraTargets {
     pub fn update(&mut self, targets: &Targets) {
         self.users.clear();
         let road_users = &targets.movers[..targets.road_users];
-        self.users.extend(road_users.iter().map(RoadUserBody::new));
+        self.users
+            .extend(road_users.iter().map(|mover| RoadUserBody::new(mover, mover.end)));
+    }
+
+    /// Replaces the road users by those at the end of a sub-step of the tick of `targets`.
+    pub fn update_within(&mut self, targets: &Targets, sub_step: usize) {
+        self.users.clear();
+        let road_users = targets.movers[..targets.road_users].iter().enumerate();
+        self.users
+            .extend(road_users.map(|(row, mover)| RoadUserBody::new(mover, targets.pose(row, sub_step, 1.0, 0.0))));
+    }
+
+    /// The motion of a road user in the image since an earlier time; `None` if it was not there.
+    pub(super) fn motion(
+        &self,
+        row: usize,
+        now: &SensorPose,
+        past: &SensorPose,
+        poses: &PastPoses,
+    ) -> Option<PixelMotion> {
+        let user = &self.users[row];
+        let before = poses.of(user.body.instance)?;
+        Some(PixelMotion::of_body(now, past, &user.pose, before, user.is_round))
     }
 
     /// Number of road users.
@@ -88,9 +113,9 @@ impl CameraTargets {
 }
 
 impl RoadUserBody {
-    fn new(mover: &MovingTarget) -> Self {
-        let (sin, cos) = libm::sincos(mover.end.attitude_rad[2]);
-        let [x, y, z] = mover.end.position_m;
+    fn new(mover: &MovingTarget, pose: Pose) -> Self {
+        let (sin, cos) = libm::sincos(pose.attitude_rad[2]);
+        let [x, y, z] = pose.position_m;
         let middle_m = 0.5 * (mover.rear_m + mover.front_m);
         let length_m = mover.front_m - mover.rear_m;
         let is_two_wheeler = mover.word & 0xFF == Tag::TwoWheeler as u32;
@@ -140,6 +165,7 @@ impl RoadUserBody {
                 label: label as u8,
                 is_interesting: true,
             },
+            pose,
         }
     }
 }

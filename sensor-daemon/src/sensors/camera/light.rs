@@ -25,6 +25,15 @@ pub(super) struct Daylight {
     sunlight: f64,
 }
 
+/// Extinction by rain, 1/m, as for the LIDAR (Goodin et al. 2019). Drops are large against all wavelengths of cameras.
+pub(super) fn rain_extinction_per_m(rain_mmph: f64) -> f64 {
+    if rain_mmph > 0.0 {
+        0.01 * libm::pow(rain_mmph, 0.6)
+    } else {
+        0.0
+    }
+}
+
 impl Daylight {
     pub(super) fn new(weather: &WeatherConfig) -> Self {
         let (sin_up, cos_up) = libm::sincos(weather.sun_elevation_deg.to_radians());
@@ -37,18 +46,12 @@ impl Daylight {
             0.0
         };
         let fog_per_m = KOSCHMIEDER / weather.visibility_m.max(1.0);
-        // As for the LIDAR: Goodin et al. 2019.
-        let rain_per_m = if weather.rain_mmph > 0.0 {
-            0.01 * libm::pow(weather.rain_mmph, 0.6)
-        } else {
-            0.0
-        };
         Self {
             sun: [cos_up * sin_az, cos_up * cos_az, sin_up],
             ambient: daylight * (0.8 - 0.3 * sunlight),
             direct: 0.7 * sunlight,
             daylight,
-            extinction_per_m: (fog_per_m + rain_per_m) as f32,
+            extinction_per_m: (fog_per_m + rain_extinction_per_m(weather.rain_mmph)) as f32,
             sunlight,
         }
     }

@@ -1,4 +1,5 @@
-//! Cameras: depth, instances, classes, colours, boxes. An image is a visibility buffer over the polygons of the scene, see [`raster`](self).
+//! Cameras: depth, instances, classes, colours, temperatures, optical flow, events, boxes. An image is a visibility buffer over the polygons
+//! of the scene, see [`raster`](self).
 //!
 //! The result depends on the configuration and the world of the tick alone, not on threads, the order of objects or the processor. How it
 //! works and what it costs: docs/camera.md.
@@ -10,6 +11,8 @@ use sim_core::scene::Scene;
 
 mod bodies;
 mod boxes;
+mod events;
+mod flow;
 mod ground;
 mod labels;
 mod light;
@@ -18,9 +21,12 @@ mod raster;
 mod relief;
 mod resolve;
 mod surfaces;
+mod thermal;
 mod view;
 
 pub use bodies::CameraTargets;
+pub use events::{EventMemory, SampledSpan, sort_events};
+pub use flow::PastPoses;
 pub use ipc_schema::image::{SKY_INSTANCE, SeenObject};
 pub use labels::SemanticLabel;
 pub use optics::CameraParams;
@@ -46,6 +52,7 @@ pub struct SightScene {
     bodies: bodies::StillBodies,
     ground: ground::GroundMap,
     light: light::Daylight,
+    thermal: thermal::ThermalLight,
     /// Colours of the ground, by class.
     ground_colours: Box<[[f32; 3]; 256]>,
     /// Height of flat ground; `None` if it is not flat.
@@ -66,6 +73,7 @@ impl SightScene {
             bodies: bodies::StillBodies::new(&config.lidar, scene),
             ground: ground::GroundMap::new(scene),
             light,
+            thermal: thermal::ThermalLight::new(&config.weather),
             ground_colours,
             ground_m: flat_ground_m(scene),
             relief: relief::Relief::new(scene),
@@ -80,6 +88,20 @@ pub struct CameraScratch {
     list: view::DrawList,
     surfaces: surfaces::SurfaceTable,
     counts: Vec<resolve::PixelCount>,
+    motions: resolve::ImageMotions,
+}
+
+/// What an image is taken of.
+#[derive(Debug, Clone, Copy)]
+pub struct CameraShot<'a> {
+    /// The road users.
+    pub targets: &'a CameraTargets,
+    /// Row of the road user that carries the camera and is invisible to it.
+    pub carrier: Option<usize>,
+    /// The camera.
+    pub pose: CameraPose,
+    /// Camera and road users at the time since which the optical flow counts; without it there is no flow.
+    pub past: Option<(CameraPose, &'a PastPoses)>,
 }
 
 /// Position and attitude of a camera in the world.
@@ -157,13 +179,26 @@ impl CameraModel {
         Some(CameraPose(self.optics.mount.sensor(&mover.end)))
     }
 
-    /// Takes an image at the end of a tick: fills the planes that are wanted, and `objects` with the road users in the image, in the
-    /// order of their rows. The road user in row `carrier` is invisible. A plane whose length is not that of the image stays as it is.
+    /// The camera on the road user in `row` at the end of a sub-step; `None` if there is no such row.
+    #[must_use]
+    pub fn pose_within(&self, targets: &Targets, row: usize, sub_step: usize) -> Option<CameraPose> {
+        targets.movers.get(row)?;
+        Some(CameraPose(
+            self.optics.mount.sensor(&targets.pose(row, sub_step, 1.0, 0.0)),
+        ))
+    }
+
+    /// The camera on a road user at an earlier time; `None` if it was not there.
+    #[must_use]
+    pub fn past_pose_on(&self, vehicle: u32, poses: &PastPoses) -> Option<CameraPose> {
+        poses.of(vehicle).map(|pose| CameraPose(self.optics.mount.sensor(pose)))
+    }
+
+    /// Takes an image: fills the planes that are wanted, and `objects` with the road users in the image, in the order of their rows. A
+    /// plane whose length is not that of the image stays as it is.
     pub fn take(
         &self,
-        targets: &CameraTargets,
-        carrier: Option<usize>,
-        pose: &CameraPose,
+        shot: &CameraShot<'_>,
         scratch: &mut CameraScratch,
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
@@ -175,48 +210,42 @@ impl CameraModel {
         )]
         match self.path {
             // SAFETY: `CameraModel::path` holds only instructions that `ScanPath::is_here` has detected on this processor.
-            ScanPath::Avx512 => return unsafe { self.take_avx512(targets, carrier, pose, scratch, planes, objects) },
+            ScanPath::Avx512 => return unsafe { self.take_avx512(shot, scratch, planes, objects) },
             // SAFETY: as above.
-            ScanPath::Avx2 => return unsafe { self.take_avx2(targets, carrier, pose, scratch, planes, objects) },
+            ScanPath::Avx2 => return unsafe { self.take_avx2(shot, scratch, planes, objects) },
             ScanPath::Plain => {}
         }
-        self.take_with::<simd::plain::Plain>(targets, carrier, pose, scratch, planes, objects);
+        self.take_with::<simd::plain::Plain>(shot, scratch, planes, objects);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl")]
     fn take_avx512(
         &self,
-        targets: &CameraTargets,
-        carrier: Option<usize>,
-        pose: &CameraPose,
+        shot: &CameraShot<'_>,
         scratch: &mut CameraScratch,
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
     ) {
-        self.take_with::<simd::avx512::Avx512>(targets, carrier, pose, scratch, planes, objects);
+        self.take_with::<simd::avx512::Avx512>(shot, scratch, planes, objects);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn take_avx2(
         &self,
-        targets: &CameraTargets,
-        carrier: Option<usize>,
-        pose: &CameraPose,
+        shot: &CameraShot<'_>,
         scratch: &mut CameraScratch,
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
     ) {
-        self.take_with::<simd::avx2::Avx2>(targets, carrier, pose, scratch, planes, objects);
+        self.take_with::<simd::avx2::Avx2>(shot, scratch, planes, objects);
     }
 
     #[inline(always)]
     fn take_with<S: Simd>(
         &self,
-        targets: &CameraTargets,
-        carrier: Option<usize>,
-        pose: &CameraPose,
+        shot: &CameraShot<'_>,
         scratch: &mut CameraScratch,
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
@@ -224,17 +253,19 @@ impl CameraModel {
         let sight = &*self.sight;
         let view = view::CameraView {
             optics: &self.optics,
-            pose: pose.0,
+            pose: shot.pose.0,
         };
         let CameraScratch {
             canvas,
             list,
             surfaces,
             counts,
+            motions,
         } = scratch;
+        let (targets, carrier) = (shot.targets, shot.carrier);
         // Gather what may be in the image, and sort it.
         list.clear();
-        surfaces.begin((!planes.rgb.is_empty()).then_some(sight.light));
+        surfaces.begin(planes.have_colours().then_some(sight.light));
         sight.bodies.gather(&view, list, surfaces);
         targets.gather(&view, carrier, list, surfaces);
         if let Some(relief) = &sight.relief {
@@ -249,6 +280,15 @@ impl CameraModel {
         );
         canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
         // Write what that surface shows.
+        motions.still = None;
+        motions.users.clear();
+        if let (false, Some((past, poses))) = (planes.flow_px.is_empty(), &shot.past) {
+            motions.still = Some(flow::PixelMotion::of_still(&view.pose, &past.0));
+            let rows = surfaces.users.iter().map(|row| *row as usize);
+            motions
+                .users
+                .extend(rows.map(|row| targets.motion(row, &view.pose, &past.0, poses)));
+        }
         counts.clear();
         counts.resize(surfaces.users.len(), resolve::PixelCount::NONE);
         let resolver = resolve::Resolver {
@@ -258,6 +298,8 @@ impl CameraModel {
             ground: &sight.ground,
             light: &sight.light,
             ground_colours: &sight.ground_colours,
+            thermal: &sight.thermal,
+            motions,
         };
         resolver.write::<S>(planes, counts);
         objects.clear();

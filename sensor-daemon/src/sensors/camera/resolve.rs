@@ -1,11 +1,13 @@
 //! From the surface that each pixel sees to the planes of the image, and the boxes of the road users in it.
 
 use super::{
+    flow::PixelMotion,
     ground::GroundMap,
     labels::SemanticLabel,
     light::Daylight,
-    raster::{Canvas, GROUND_SURFACE, LinearForm},
+    raster::{Canvas, GROUND_SURFACE, LinearForm, SKY_SURFACE},
     surfaces::{NO_USER, SurfaceTable},
+    thermal::ThermalLight,
     view::CameraView,
 };
 use crate::sensors::lidar::simd::{Floats, Simd, WIDTH, Words};
@@ -23,6 +25,19 @@ pub struct ImagePlanes<'a> {
     pub rgb: &'a mut [[u8; 3]],
     /// 255 on road users and props of interest, else 0.
     pub binary: &'a mut [u8],
+    /// Apparent temperature, hundredths of a kelvin.
+    pub infrared: &'a mut [u16],
+    /// Optical flow, pixels to the right and down.
+    pub flow_px: &'a mut [[f32; 2]],
+    /// Relative luminance of the colours, linear: what a dynamic vision sensor samples.
+    pub brightness: &'a mut [f32],
+}
+
+impl ImagePlanes<'_> {
+    /// True if a plane shows light.
+    pub(super) fn have_colours(&self) -> bool {
+        !self.rgb.is_empty() || !self.brightness.is_empty()
+    }
 }
 
 /// Pixels of a road user that are in the image.
@@ -57,6 +72,25 @@ pub(super) struct Resolver<'a> {
     pub(super) light: &'a Daylight,
     /// Colours of the ground, by class.
     pub(super) ground_colours: &'a [[f32; 3]; 256],
+    pub(super) thermal: &'a ThermalLight,
+    pub(super) motions: &'a ImageMotions,
+}
+
+/// The motion of all that an image shows since an earlier time; `None` of what was not there.
+#[derive(Debug, Default)]
+pub(super) struct ImageMotions {
+    pub(super) still: Option<PixelMotion>,
+    /// One for each road user of the surface table.
+    pub(super) users: Vec<Option<PixelMotion>>,
+}
+
+impl ImageMotions {
+    fn of(&self, user: u16) -> Option<&PixelMotion> {
+        match user {
+            NO_USER => self.still.as_ref(),
+            user => self.users.get(usize::from(user))?.as_ref(),
+        }
+    }
 }
 
 /// A run of pixels of one road user.
@@ -72,8 +106,11 @@ struct Pixels {
     surface: Words,
     /// Class of the pixels on the ground.
     label: [u8; WIDTH],
-    /// Share of the light that reaches the camera.
+    /// Share of the light that reaches the camera, and of the thermal infrared.
     clear: Floats,
+    thermal_clear: Floats,
+    /// Inverse of the depth, 1/m.
+    inverse: Floats,
 }
 
 impl Resolver<'_> {
@@ -93,6 +130,9 @@ impl Resolver<'_> {
                 let pixels = self.sixteen::<S>(tile, row, &axes, planes);
                 let at = row * optics.width + first;
                 self.put(&pixels, at, count, planes);
+                if let Some(flow_px) = planes.flow_px.get_mut(at..at + count) {
+                    self.put_flow(&pixels, [tile, row], flow_px);
+                }
                 for (element, surface) in pixels.surface.0[..count].iter().enumerate() {
                     let user = self.surfaces.surfaces[*surface as usize].user;
                     if user != run.user {
@@ -117,16 +157,21 @@ impl Resolver<'_> {
             surface: self.canvas.surface[place],
             label: [SemanticLabel::Terrain as u8; WIDTH],
             clear: Floats::ZERO,
+            thermal_clear: Floats::ZERO,
+            inverse: self.canvas.inverse[place],
         };
         S::store(depth, &mut pixels.depth);
         let ground = S::equal(S::load_words(&pixels.surface), S::splat_words(GROUND_SURFACE));
-        let needs_class = !planes.semantic.is_empty() || !planes.rgb.is_empty();
+        let needs_class = !planes.semantic.is_empty() || !planes.infrared.is_empty() || planes.have_colours();
         if needs_class && S::bits(ground) != 0 {
             self.classes::<S>(depth, tile, row, axes, S::bits(ground), &mut pixels.label);
         }
-        if !planes.rgb.is_empty() {
-            let clear = crate::sensors::lidar::exp_minus::<S>(depth * S::splat(self.light.extinction_per_m));
-            S::store(clear, &mut pixels.clear);
+        let clear = |extinction_per_m: f32| crate::sensors::lidar::exp_minus::<S>(depth * S::splat(extinction_per_m));
+        if planes.have_colours() {
+            S::store(clear(self.light.extinction_per_m), &mut pixels.clear);
+        }
+        if !planes.infrared.is_empty() {
+            S::store(clear(self.thermal.extinction_per_m), &mut pixels.thermal_clear);
         }
         pixels
     }
@@ -194,20 +239,60 @@ impl Resolver<'_> {
                 };
             }
         }
+        if !planes.have_colours() && planes.infrared.is_empty() {
+            return;
+        }
+        let sky = self.light.sky();
+        let colour = |element: usize| {
+            let surface = pixels.surface.0[element];
+            let colour = match surface {
+                GROUND_SURFACE => &self.ground_colours[usize::from(pixels.label[element])],
+                _ => &table[surface as usize].colour,
+            };
+            let clear = pixels.clear.0[element];
+            [0, 1, 2].map(|i: usize| sky[i] + clear * (colour[i] - sky[i]))
+        };
         if let Some(rgb) = planes.rgb.get_mut(at..at + count) {
-            let sky = self.light.sky();
             for (element, to) in rgb.iter_mut().enumerate() {
-                let surface = pixels.surface.0[element];
-                let colour = match surface {
-                    GROUND_SURFACE => &self.ground_colours[usize::from(pixels.label[element])],
-                    _ => &table[surface as usize].colour,
-                };
-                let clear = pixels.clear.0[element];
-                *to = [0, 1, 2].map(|i: usize| {
-                    let mixed = sky[i] + clear * (colour[i] - sky[i]);
-                    (mixed * 255.0 + 0.5).clamp(0.0, 255.0) as u8
-                });
+                *to = colour(element).map(|part| (part * 255.0 + 0.5).clamp(0.0, 255.0) as u8);
             }
+        }
+        if let Some(brightness) = planes.brightness.get_mut(at..at + count) {
+            for (element, to) in brightness.iter_mut().enumerate() {
+                // Rec. 709.
+                let [red, green, blue] = colour(element);
+                *to = 0.2126 * red + 0.7152 * green + 0.0722 * blue;
+            }
+        }
+        if let Some(infrared) = planes.infrared.get_mut(at..at + count) {
+            for (element, to) in infrared.iter_mut().enumerate() {
+                let radiance = match pixels.surface.0[element] {
+                    GROUND_SURFACE => self.thermal.of(pixels.label[element]),
+                    surface => self.thermal.of(table[surface as usize].label),
+                };
+                *to = self.thermal.pixel(radiance, pixels.thermal_clear.0[element]);
+            }
+        }
+    }
+
+    /// Optical flow of the pixels of a tile's row.
+    #[inline(always)]
+    fn put_flow(&self, pixels: &Pixels, [tile, row]: [usize; 2], flow_px: &mut [[f32; 2]]) {
+        let focal_px = self.view.optics.focal_px as f32;
+        let b = self.canvas.b[row];
+        for (element, to) in flow_px.iter_mut().enumerate() {
+            let surface = pixels.surface.0[element];
+            let seen = &self.surfaces.surfaces[surface as usize];
+            // The sky is infinitely far away.
+            let inverse = if surface == SKY_SURFACE {
+                0.0
+            } else {
+                pixels.inverse.0[element]
+            };
+            *to = match self.motions.of(seen.user) {
+                Some(motion) => motion.flow_px([self.canvas.a[tile].0[element], b], inverse, focal_px),
+                None => [f32::NAN; 2],
+            };
         }
     }
 }

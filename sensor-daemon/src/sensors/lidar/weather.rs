@@ -74,6 +74,7 @@ mod tests {
             sun_elevation_deg: 30.0,
             sun_azimuth_deg: 180.0,
             sunlight,
+            air_temperature_c: 15.0,
         }
     }
 

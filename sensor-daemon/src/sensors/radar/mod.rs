@@ -20,8 +20,8 @@ mod equation;
 pub use equation::{RadarEquation, from_db, rain_db_per_km, to_db};
 
 use super::camera::{
-    CameraModel, CameraParams, CameraPose, CameraScratch, CameraTargets, ImagePlanes, SKY_INSTANCE, SemanticLabel,
-    SightScene,
+    CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, ImagePlanes, SKY_INSTANCE,
+    SemanticLabel, SightScene,
 };
 use crate::{noise::normals::philox4x32, sensors::lidar::Targets};
 
@@ -228,7 +228,13 @@ impl RadarModel {
             ..ImagePlanes::default()
         };
         let (camera, objects) = (&mut scratch.camera, &mut scratch.objects);
-        self.eyes.take(seen, Some(row), pose, camera, &mut planes, objects);
+        let shot = CameraShot {
+            targets: seen,
+            carrier: Some(row),
+            pose: *pose,
+            past: None,
+        };
+        self.eyes.take(&shot, camera, &mut planes, objects);
     }
 
     /// Adds up the echoes of each cell.

@@ -13,6 +13,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     let refused = imu(config)
         .or_else(|| lidar(config))
         .or_else(|| observed_plane(config))
+        .or_else(|| brightness_events(config))
         .or_else(|| observation(config));
     match refused {
         None => Ok(()),
@@ -78,6 +79,8 @@ fn observed_plane(config: &Config) -> Option<BrokenSensorRule> {
         ImagePlane::Semantic => "semantic",
         ImagePlane::Rgb => "rgb",
         ImagePlane::Binary => "binary",
+        ImagePlane::Infrared => "infrared",
+        ImagePlane::Flow => "flow",
     };
     (ImagePlane::wanted(camera) & plane.bit() == 0).then(|| {
         (
@@ -86,6 +89,29 @@ fn observed_plane(config: &Config) -> Option<BrokenSensorRule> {
             format!("set camera.{name} = true, or camera.observed = \"none\""),
         )
     })
+}
+
+/// A dynamic vision sensor samples at every tick.
+fn brightness_events(config: &Config) -> Option<BrokenSensorRule> {
+    let units = config.sensor_units(SensorKind::Camera);
+    let slow = units
+        .iter()
+        .find(|unit| unit.period_ticks != 1 && config.with_unit(unit).camera.events)?;
+    let camera = match slow.suite.as_str() {
+        "" => "`camera`".to_owned(),
+        suite => format!("camera `{}` of the suite `{suite}`", slow.name),
+    };
+    Some((
+        "camera.events",
+        format!(
+            "{camera} has events, but takes an image every {} ticks only",
+            slow.period_ticks
+        ),
+        format!(
+            "set its period_s to {}, that of a tick, or events = false",
+            config.run.tick_s
+        ),
+    ))
 }
 
 pub(super) fn lidar(config: &Config) -> Option<BrokenSensorRule> {

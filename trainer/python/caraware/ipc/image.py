@@ -1,4 +1,4 @@
-"""Images of cameras: depths, objects, classes, colours, and the road users in them."""
+"""Images of cameras: depths, objects, classes, colours, temperatures, optical flow, events, and the road users in them."""
 
 import math
 from dataclasses import dataclass
@@ -19,6 +19,9 @@ IMAGE = record("ImageHead")
 
 SEEN = record("SeenObject")
 """`SeenObject`: a road user of which an image shows a pixel, its visible and its full box (pixels), its depths (m)."""
+
+EVENT = record("BrightnessEvent")
+"""`BrightnessEvent`: a pixel became brighter or darker: time since the begin of the tick (µs), column, row, polarity."""
 
 SKY = 0xFFFF_FFFE
 """`instance` of a pixel that sees the sky."""
@@ -49,14 +52,16 @@ class Label(IntEnum):
     CROSSING = 42
 
 
-PLANES: tuple[tuple[str, str, tuple[int, ...]], ...] = (
-    ("depth_m", "<f4", ()),
-    ("instance", "<u4", ()),
-    ("semantic", "|u1", ()),
-    ("rgb", "|u1", (3,)),
-    ("binary", "|u1", ()),
+PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = (
+    ("depth_m", 0, "<f4", ()),
+    ("instance", 1, "<u4", ()),
+    ("flow_px", 6, "<f4", (2,)),
+    ("infrared", 5, "<u2", ()),
+    ("semantic", 2, "|u1", ()),
+    ("rgb", 3, "|u1", (3,)),
+    ("binary", 4, "|u1", ()),
 )
-"""Name, scalar and shape of a pixel of each plane, in the order in which a message has them; its place is its bit."""
+"""Name, bit, scalar and shape of a pixel of each plane, in the order in which a message has them."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ class ImageShape:
         plane = str(camera.get("observed", "none"))
         if plane == "none" or int(camera["vehicles"]) == 0:
             return None
-        shape = next(shape for name, _, shape in PLANES if name == plane)
+        shape = next(shape for name, _, _, shape in PLANES if name == plane)
         return cls(plane, math.prod(shape), int(camera["height"]), int(camera["width"]))
 
     @property
@@ -111,11 +116,18 @@ class Image:
     """u8 [height, width, 3]."""
     binary: NDArray[np.uint8] | None
     """u8 [height, width]: 255 on road users and props of interest, else 0."""
+    infrared: NDArray[np.uint16] | None
+    """u16 [height, width]: apparent temperature in the thermal infrared, 0.01 K."""
+    flow_px: Float32Array | None
+    """f32 [height, width, 2]: how far what the pixel shows has moved to the right and down within `camera.period_s`, pixels;
+    not a number where it was not in front of the camera then, and in the first image of an episode."""
+    events: NDArray[np.void]
+    """`EVENT [count]`, read-only: the events of the tick in the order of time; empty without `camera.events`."""
 
     @classmethod
     def of(cls, native: _native.SightMessage, names: SensorNames) -> "Image":
         """From a message. Raises ValueError for planes that do not fit the image's size."""
-        head_bytes, plane_bytes, object_bytes = native.sections
+        head_bytes, plane_bytes, object_bytes, event_bytes = native.sections
         head = np.frombuffer(head_bytes, IMAGE)[0]
         planes = split_planes(head, plane_bytes)
         return cls(
@@ -130,6 +142,9 @@ class Image:
             semantic=planes["semantic"],
             rgb=planes["rgb"],
             binary=planes["binary"],
+            infrared=planes["infrared"],
+            flow_px=planes["flow_px"],
+            events=np.frombuffer(event_bytes, EVENT),
         )
 
 
@@ -138,7 +153,7 @@ def split_planes(head: np.void, planes: bytes) -> dict[str, NDArray[Any] | None]
     height, width = int(head["height"]), int(head["width"])
     found: dict[str, NDArray[Any] | None] = {}
     at = 0
-    for bit, (name, scalar, shape) in enumerate(PLANES):
+    for name, bit, scalar, shape in PLANES:
         found[name] = None
         if int(head["planes"]) >> bit & 1:
             count = height * width * math.prod(shape)

@@ -87,7 +87,7 @@ class CameraImage(SensorMessage):
     @property
     def planes(self) -> tuple[str, ...]:
         """Names of the planes that it has."""
-        return tuple(name for bit, (name, *_) in enumerate(PLANES) if int(self.head["planes"]) >> bit & 1)
+        return tuple(name for name, bit, *_ in PLANES if int(self.head["planes"]) >> bit & 1)
 
     @property
     def world_from_optical(self) -> Float64Array:
