@@ -132,6 +132,10 @@ pub struct ImageHead {
     pub sensor: u32,
     /// Events that the message has no room for: the last of the tick.
     pub lost_events: u32,
+    /// Lens distortion: k1, k2, p1, p2, k3 of Brown's model, as in OpenCV; zeros of a pinhole.
+    pub distortion: [f32; 5],
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// A road user of which an image shows a pixel at least, with the fields of KITTI's labels.

@@ -248,7 +248,9 @@ pub fn table() -> Vec<TypeLayout> {
             focal_px,
             range_m,
             sensor,
-            lost_events
+            lost_events,
+            distortion,
+            reserved
         }),
         layout!(BrightnessEvent {
             time_us,

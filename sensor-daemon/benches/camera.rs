@@ -165,6 +165,7 @@ fn main() {
                 height,
                 horizontal_fov_deg: 90.0,
                 range_m: 150.0,
+                distortion: [0.0; 5],
                 mount: [1.5, 0.0, 1.4, 0.0, 0.0, 0.0],
             };
             let camera = CameraModel::new(&params, &lidar_city::config(), &scene).with_path(path);

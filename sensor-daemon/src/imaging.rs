@@ -81,6 +81,7 @@ struct NumberedCamera {
     maps: Vec<CameraModel>,
     planes: u32,
     range_m: f32,
+    distortion: [f32; 5],
     plane_bytes: usize,
     /// Ticks since which the optical flow counts; 0 without it.
     flow_ticks: u64,
@@ -283,6 +284,7 @@ impl CameraImaging {
                 maps: maps.collect(),
                 planes: ImagePlane::wanted(&camera),
                 range_m: camera.range_m as f32,
+                distortion: camera.distortion.map(|part| part as f32),
                 plane_bytes: ImagePlane::bytes(&camera),
                 flow_ticks: if camera.flow { u64::from(unit.period_ticks) } else { 0 },
                 events: camera
@@ -432,6 +434,8 @@ impl CameraImaging {
             range_m: numbered.range_m,
             sensor: unit.sensor,
             lost_events: lost_events as u32,
+            distortion: numbered.distortion,
+            reserved: 0,
         }));
         let hashed = hashed_head(head, offset_of!(ImageHead, sensor), unit.sensor);
         self.totals

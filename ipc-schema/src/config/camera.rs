@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::LensDistortion;
 use crate::image::ImagePlane;
 
 /// The camera of a vehicle.
@@ -21,6 +22,8 @@ pub struct CameraConfig {
     pub horizontal_fov_deg: f64,
     /// Depth at which an image ends, metres: what is farther is sky.
     pub range_m: f64,
+    /// Lens distortion: k1, k2, p1, p2, k3 of Brown's model, as in OpenCV; zeros = a pinhole.
+    pub distortion: [f64; 5],
     /// Where it is mounted: x, y, z from the centre of the rear axle on the ground (metres), then roll, pitch (nose up), yaw (radians).
     pub mount: [f64; 6],
     /// Images have depths.
@@ -89,6 +92,29 @@ impl CameraConfig {
     pub fn observed_shape(&self) -> Option<[usize; 3]> {
         let plane = self.observed.plane().filter(|_| self.vehicles > 0)?;
         Some([self.height as usize, self.width as usize, plane.pixel_bytes()])
+    }
+
+    /// Distance of the pinhole from the image, pixels: the field of view is that without distortion.
+    #[must_use]
+    pub fn focal_px(&self) -> f64 {
+        0.5 * f64::from(self.width) / (0.5 * self.horizontal_fov_deg.to_radians()).tan()
+    }
+
+    /// A pixel of which the lens shows nothing, column and row: its model folds there. `None` if there is none.
+    #[must_use]
+    pub fn folded_pixel(&self) -> Option<[u32; 2]> {
+        let lens = LensDistortion::new(self.distortion);
+        let focal_px = self.focal_px();
+        let is_folded = |[u, v]: &[u32; 2]| {
+            let x = (f64::from(*u) + 0.5 - 0.5 * f64::from(self.width)) / focal_px;
+            let y = (f64::from(*v) + 0.5 - 0.5 * f64::from(self.height)) / focal_px;
+            lens.undistorted([x, y]).is_none()
+        };
+        let (right, bottom) = (self.width.saturating_sub(1), self.height.saturating_sub(1));
+        // A fold lies about the axis, so it reaches an edge first.
+        let columns = (0..self.width).flat_map(|u| [[u, 0], [u, bottom]]);
+        let rows = (0..self.height).flat_map(|v| [[0, v], [right, v]]);
+        columns.chain(rows).find(is_folded)
     }
 
     /// Pixels of an image.

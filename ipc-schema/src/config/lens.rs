@@ -97,7 +97,7 @@ mod tests {
             coefficients[place] = 0.1;
             LensDistortion::new(coefficients).distorted(point)
         };
-        let (x, y) = (0.5, 0.25);
+        let (x, y) = (0.5_f64, 0.25_f64);
         let r2 = x * x + y * y;
         let expected = [
             [x * (1.0 + 0.1 * r2), y * (1.0 + 0.1 * r2)],
@@ -108,7 +108,10 @@ mod tests {
         ];
         for (place, expected) in expected.into_iter().enumerate() {
             let found = at(place, [x, y]);
-            assert!((0..2).all(|axis| (found[axis] - expected[axis]).abs() < 1e-15), "{place}");
+            assert!(
+                (0..2).all(|axis| (found[axis] - expected[axis]).abs() < 1e-15),
+                "{place}"
+            );
         }
     }
 
@@ -119,7 +122,10 @@ mod tests {
             for step in 0..400 {
                 let ray = [f64::from(step % 20) * 0.05 - 0.475, f64::from(step / 20) * 0.04 - 0.38];
                 let found = lens.undistorted(lens.distorted(ray)).unwrap();
-                assert!((0..2).all(|axis| (found[axis] - ray[axis]).abs() < 1e-9), "{coefficients:?} {ray:?}");
+                assert!(
+                    (0..2).all(|axis| (found[axis] - ray[axis]).abs() < 1e-9),
+                    "{coefficients:?} {ray:?}"
+                );
             }
         }
     }

@@ -3,7 +3,7 @@
 use sensor_daemon::sensors::camera::SemanticLabel;
 
 use crate::{
-    CameraModel, CameraScratch, VehicleState, car, config, lidar_city,
+    CameraModel, CameraParams, CameraScratch, VehicleState, car, config, lidar_city,
     lidar_city::{Moves, traffic},
     params, scene_of, take,
 };
@@ -45,6 +45,37 @@ fn visible_boxes_are_those_counted_from_the_instances() {
         }
     }
     assert!(boxes > 30, "{boxes}");
+}
+
+#[test]
+fn a_lens_bends_the_corners_of_a_box() {
+    let distortion = [0.1, 0.0, 0.0, 0.02, 0.0];
+    let states: Vec<VehicleState> = vec![car(0, 0.0, 0.0, 0.0), car(1, 9.0, 4.0, 0.0)];
+    let params = CameraParams {
+        distortion,
+        ..params(200, 200, [0.0, 0.0, 1.2, 0.0, 0.0, 0.0])
+    };
+    let camera = CameraModel::new(&params, &config(), &scene_of(Vec::new()));
+    let (taken, _) = take(&camera, &states, 0, &mut CameraScratch::default());
+    let seen = taken.objects[0];
+    // 100 px to a slope of 1; its rear is 8 m ahead and its front 12 m, 3 to 5 m to the left, the ground 1.2 m below.
+    let bent = |ahead: f64, left: f64, below: f64| {
+        let (x, y) = (-left / ahead, below / ahead);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + 0.1 * r2;
+        [
+            100.0 + 100.0 * (x * radial + 0.02 * (r2 + 2.0 * x * x)),
+            100.0 + 100.0 * (y * radial + 0.04 * x * y),
+        ]
+    };
+    let [left, bottom] = bent(8.0, 5.0, 1.2);
+    assert!((f64::from(seen.full_box_px[0]) - left).abs() < 1e-3, "{seen:?} {left}");
+    assert!(
+        (f64::from(seen.full_box_px[3]) - bent(8.0, 3.0, 1.2)[1].max(bottom)).abs() < 1e-3,
+        "{seen:?}"
+    );
+    // The visible box is counted from bent pixels, so it ends where the bent corners do.
+    assert!((f64::from(seen.visible_box_px[0]) - left).abs() < 1.5, "{seen:?}");
 }
 
 #[test]

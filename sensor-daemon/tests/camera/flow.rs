@@ -1,7 +1,7 @@
 //! Optical flow in closed form, and against the earlier image itself.
 
 use crate::{
-    CameraModel, CameraScratch, GROUND, VehicleState, car, config, lidar_city,
+    CameraModel, CameraParams, CameraScratch, GROUND, VehicleState, car, config, lidar_city,
     lidar_city::{Moves, traffic},
     params, rectangle, scene_of, take, take_since,
 };
@@ -101,7 +101,20 @@ fn what_was_not_there_has_no_flow() {
 /// The earlier image shows the same thing at the place from which a pixel has moved, unless something hid it there.
 #[test]
 fn the_earlier_image_shows_the_same_at_the_earlier_place() {
-    let camera = CameraModel::new(&params(200, 120, MOUNT), &config(), &lidar_city::scene(500, 1));
+    agrees_with_the_earlier_image([0.0; 5]);
+}
+
+#[test]
+fn so_it_does_through_a_lens() {
+    agrees_with_the_earlier_image([-0.12, 0.01, 0.004, -0.006, 0.0]);
+}
+
+fn agrees_with_the_earlier_image(distortion: [f64; 5]) {
+    let params = CameraParams {
+        distortion,
+        ..params(200, 120, MOUNT)
+    };
+    let camera = CameraModel::new(&params, &config(), &lidar_city::scene(500, 1));
     let mut scratch = CameraScratch::default();
     let (mut compared, mut same, mut of_users) = (0, 0, 0);
     for tick in 0..8 {

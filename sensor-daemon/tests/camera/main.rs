@@ -45,6 +45,7 @@ fn params(width: usize, height: usize, mount: [f64; 6]) -> CameraParams {
         height,
         horizontal_fov_deg: 90.0,
         range_m: 120.0,
+        distortion: [0.0; 5],
         mount,
     }
 }

@@ -10,7 +10,7 @@ use sensor_daemon::sensors::camera::SKY_INSTANCE;
 use sim_core::scene::{RoadPiece, SurfaceKind};
 
 use crate::{
-    CameraModel, CameraPose, CameraScratch, GROUND, Kind, Road, Scene, VehicleState, config, lidar_city,
+    CameraModel, CameraParams, CameraPose, CameraScratch, GROUND, Kind, Road, Scene, VehicleState, config, lidar_city,
     lidar_city::{Moves, Random, scene, traffic},
     params, take,
 };
@@ -186,7 +186,34 @@ fn axes(pose: &CameraPose) -> [[f64; 3]; 3] {
     })
 }
 
+/// Slopes of the ray that a lens puts at these slopes, by repeated substitution as in OpenCV's `undistortPoints`; x to the right, y down.
+fn undistorted([k1, k2, p1, p2, k3]: [f64; 5], [x_d, y_d]: [f64; 2]) -> [f64; 2] {
+    let (mut x, mut y) = (x_d, y_d);
+    for _ in 0..200 {
+        let r2 = x * x + y * y;
+        let radial = 1.0 + k1 * r2 + k2 * r2 * r2 + k3 * r2 * r2 * r2;
+        let (dx, dy) = (
+            2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        );
+        (x, y) = ((x_d - dx) / radial, (y_d - dy) / radial);
+    }
+    [x, y]
+}
+
 fn compare(scene: &Scene, moves: Moves, images: std::ops::Range<usize>, size: [usize; 2], seed: u64) -> Agreement {
+    compare_through([0.0; 5], scene, moves, images, size, seed)
+}
+
+/// Compares images of a camera whose lens has this distortion.
+fn compare_through(
+    distortion: [f64; 5],
+    scene: &Scene,
+    moves: Moves,
+    images: std::ops::Range<usize>,
+    size: [usize; 2],
+    seed: u64,
+) -> Agreement {
     let (mut states, _) = traffic(200, 60, moves, 0, seed);
     for state in &mut states {
         state.z_m = scene.ground_height_m(state.x_m, state.y_m);
@@ -205,7 +232,10 @@ fn compare(scene: &Scene, moves: Moves, images: std::ops::Range<usize>, size: [u
             turned[1],
             random.between(-3.0, 3.0),
         ];
-        let params = params(size[0], size[1], mount);
+        let params = CameraParams {
+            distortion,
+            ..params(size[0], size[1], mount)
+        };
         let camera = CameraModel::new(&params, &config(), scene);
         let (taken, pose) = take(&camera, &states, row, &mut scratch);
         let world = World::new(scene, &states, params.range_m);
@@ -214,8 +244,9 @@ fn compare(scene: &Scene, moves: Moves, images: std::ops::Range<usize>, size: [u
         for pixel in 0..size[0] * size[1] {
             let (u, v) = (pixel % size[0], pixel / size[0]);
             let ray = |du: f64, dv: f64| {
-                let a = (0.5 * size[0] as f64 - u as f64 - 0.5 - du) / camera.focal_px();
-                let b = (0.5 * size[1] as f64 - v as f64 - 0.5 - dv) / camera.focal_px();
+                let x = (u as f64 + 0.5 + du - 0.5 * size[0] as f64) / camera.focal_px();
+                let y = (v as f64 + 0.5 + dv - 0.5 * size[1] as f64) / camera.focal_px();
+                let [a, b] = undistorted(distortion, [x, y]).map(|slope| -slope);
                 let length = (1.0 + a * a + b * b).sqrt();
                 let ray: [f64; 3] = std::array::from_fn(|i| (ahead[i] + a * left[i] + b * up[i]) / length);
                 (ray, length)
@@ -279,6 +310,28 @@ fn leaning_cameras_see_what_parry_sees() {
 #[test]
 fn cameras_on_hills_see_what_parry_sees() {
     check(&compare(&hilly(), Moves::Wildly, 12..16, [160, 120], 6));
+}
+
+#[test]
+fn cameras_with_a_lens_see_what_parry_sees_along_its_rays() {
+    let [barrel, pincushion] = [[-0.12, 0.01, 0.004, -0.006, 0.0], [0.08, 0.02, 0.0, 0.01, 0.001]];
+    check(&compare_through(
+        barrel,
+        &scene(500, 1),
+        Moves::Wildly,
+        6..9,
+        [160, 120],
+        7,
+    ));
+    check(&compare_through(
+        pincushion,
+        &scene(500, 1),
+        Moves::Straight,
+        0..3,
+        [150, 117],
+        8,
+    ));
+    check(&compare_through(barrel, &hilly(), Moves::Wildly, 12..14, [160, 120], 9));
 }
 
 /// Ten million rays: `cargo test --release --test camera -- --ignored ten_million`.

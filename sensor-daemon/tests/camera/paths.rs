@@ -3,17 +3,31 @@
 use sensor_daemon::sensors::lidar::ScanPath;
 
 use crate::{
-    CameraModel, CameraScratch, Taken, VehicleState, config, lidar_city,
+    CameraModel, CameraParams, CameraScratch, Taken, VehicleState, config, lidar_city,
     lidar_city::{Moves, traffic},
     params, take_since,
 };
 
 fn busy(path: ScanPath, size: [usize; 2], states: &[VehicleState], scratch: &mut CameraScratch) -> Taken {
+    busy_through([0.0; 5], path, size, states, scratch)
+}
+
+/// An image through a lens with this distortion.
+fn busy_through(
+    distortion: [f64; 5],
+    path: ScanPath,
+    size: [usize; 2],
+    states: &[VehicleState],
+    scratch: &mut CameraScratch,
+) -> Taken {
     let mut config = config();
     config.weather.visibility_m = 300.0;
     config.weather.sunlight = 0.7;
     config.weather.sun_elevation_deg = 30.0;
-    let params = params(size[0], size[1], [1.5, 0.0, 1.4, 0.02, -0.03, 0.3]);
+    let params = CameraParams {
+        distortion,
+        ..params(size[0], size[1], [1.5, 0.0, 1.4, 0.02, -0.03, 0.3])
+    };
     let camera = CameraModel::new(&params, &config, &lidar_city::scene(500, 1)).with_path(path);
     assert!(camera.path() == path);
     let before: Vec<_> = states
@@ -35,6 +49,19 @@ fn every_path_gives_the_same_bytes() {
         for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
             let taken = busy(path, size, &states, &mut CameraScratch::default());
             assert!(taken == expected, "{path:?} {size:?}");
+        }
+        let lens = [-0.12, 0.01, 0.004, -0.006, 0.0];
+        let bent = busy_through(lens, ScanPath::Plain, size, &states, &mut CameraScratch::default());
+        assert!(size == [1, 1] || bent != expected, "{size:?}");
+        for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
+            // The scratch memory has the size, but not the lens, of another camera.
+            let mut scratch = CameraScratch::default();
+            assert!(busy(path, size, &states, &mut scratch) == expected);
+            assert!(
+                busy_through(lens, path, size, &states, &mut scratch) == bent,
+                "{path:?} {size:?}"
+            );
+            assert!(busy(path, size, &states, &mut scratch) == expected);
         }
     }
 }

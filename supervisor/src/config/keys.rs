@@ -399,6 +399,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("camera.height", "", 1, 4096, "Rows of an image."),
     float("camera.horizontal_fov_deg", "deg", 1.0, 170.0, "Horizontal field of view; pixels are square."),
     float("camera.range_m", "m", 1.0, 2000.0, "Depth at which an image ends: what is farther is sky."),
+    floats("camera.distortion", "", 5, -10.0, 10.0, "Lens distortion by Brown's model: k1, k2, p1, p2, k3, as OpenCV orders them; zeros = a pinhole. The field of view is that without distortion."),
     floats("camera.mount", "m, rad", 6, -100.0, 100.0, "Mounting pose: x, y, z from the centre of the rear axle on the ground (m), then roll, pitch (nose up), yaw (rad)."),
     other("camera.depth", ValueKind::Flag, "Images have the distance along the optical axis."),
     other("camera.instance", ValueKind::Flag, "Images have the object that each pixel sees."),

@@ -257,6 +257,19 @@ fn flow_events_and_temperatures_are_those_of_the_traffic_and_are_made_again() {
 }
 
 #[test]
+fn a_lens_that_folds_within_the_image_is_refused() {
+    let workplace = Workplace::new();
+    let settings = ["camera.vehicles=1", "camera.distortion=[-0.5, 0.0, 0.0, 0.0, 0.0]"];
+    let output = workplace.run(&arguments(&settings));
+    let text = text(&output);
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(
+        text.contains("folds within the image: no ray of a pinhole arrives at the pixel (0, 0)"),
+        "{text}"
+    );
+}
+
+#[test]
 fn a_dynamic_vision_sensor_that_misses_ticks_is_refused() {
     let workplace = Workplace::new();
     let settings = ["camera.vehicles=1", "camera.events=true", "camera.period_s=0.2"];

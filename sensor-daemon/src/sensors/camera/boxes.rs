@@ -21,8 +21,13 @@ pub(super) fn seen_object(
     let optics = view.optics;
     targets.corners(view, row, |[x, y, z]| {
         depth_m = [depth_m[0].min(x), depth_m[1].max(x)];
-        let inverse = optics.focal_px / x.max(NEAREST_M);
-        let pixel = [optics.centre_px[0] - y * inverse, optics.centre_px[1] - z * inverse];
+        let inverse = 1.0 / x.max(NEAREST_M);
+        let slopes = [y * inverse, z * inverse];
+        let [a, b] = optics.lens.as_ref().map_or(slopes, |lens| lens.bent(slopes));
+        let pixel = [
+            optics.centre_px[0] - a * optics.focal_px,
+            optics.centre_px[1] - b * optics.focal_px,
+        ];
         for axis in 0..2 {
             (low[axis], high[axis]) = (low[axis].min(pixel[axis]), high[axis].max(pixel[axis]));
         }

@@ -4,6 +4,7 @@
 //! the earlier time the same point of the same body lay at `(M r + t i) / i`, where `M` and `t` follow from the poses of camera and body
 //! at both times. So the earlier pixel is that of `M r + t i`: one linear function for each body, the sky included (`i` = 0).
 
+use super::optics::CameraOptics;
 use crate::sensors::lidar::{
     Targets,
     sensor::{Rotation, SensorPose, turned},
@@ -91,7 +92,7 @@ impl PixelMotion {
     /// Flow of the pixel with the ray (1, `a`, `b`) and this inverse depth, pixels to the right and down; not a number if the point was
     /// not in front of the camera.
     #[inline(always)]
-    pub(super) fn flow_px(&self, [a, b]: [f32; 2], inverse: f32, focal_px: f32) -> [f32; 2] {
+    pub(super) fn flow_px(&self, [a, b]: [f32; 2], inverse: f32, optics: &CameraOptics) -> [f32; 2] {
         let [x, y, z] = [0, 1, 2].map(|i: usize| {
             let row = &self.matrix[i];
             row[0] + row[1] * a + row[2] * b + self.shift_m[i] * inverse
@@ -99,6 +100,13 @@ impl PixelMotion {
         if x <= 0.0 {
             return [f32::NAN; 2];
         }
-        [focal_px * (y / x - a), focal_px * (z / x - b)]
+        let focal_px = optics.focal_px as f32;
+        match &optics.lens {
+            None => [focal_px * (y / x - a), focal_px * (z / x - b)],
+            Some(lens) => {
+                let [before, now] = [[y / x, z / x], [a, b]].map(|slopes| lens.bent(slopes.map(f64::from)));
+                std::array::from_fn(|i| focal_px * (before[i] - now[i]) as f32)
+            }
+        }
     }
 }

@@ -1,8 +1,11 @@
-//! The image of a camera: its size, its field of view, its mounting.
+//! The image of a camera: its size, its field of view, its lens, its mounting.
 
-use ipc_schema::config::CameraConfig;
+use std::sync::Arc;
 
-use crate::sensors::lidar::sensor::SensorMount;
+use ipc_schema::config::{CameraConfig, LensDistortion};
+
+use super::raster::{BentRays, TILE_ROWS};
+use crate::sensors::lidar::{sensor::SensorMount, simd::WIDTH};
 
 /// A pinhole camera with square pixels, as configured.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,6 +18,8 @@ pub struct CameraParams {
     pub horizontal_fov_deg: f64,
     /// Depth at which the image ends, metres: what is farther is sky.
     pub range_m: f64,
+    /// Lens distortion: k1, k2, p1, p2, k3; zeros = a pinhole.
+    pub distortion: [f64; 5],
     /// Where it is mounted: x, y, z from the centre of the rear axle on the ground (metres), then roll, pitch (nose up), yaw (radians).
     pub mount: [f64; 6],
 }
@@ -26,13 +31,63 @@ impl From<&CameraConfig> for CameraParams {
             height: camera.height as usize,
             horizontal_fov_deg: camera.horizontal_fov_deg,
             range_m: camera.range_m,
+            distortion: camera.distortion,
             mount: camera.mount,
         }
     }
 }
 
+/// A lens that bends rays.
+#[derive(Debug, Clone)]
+pub(super) struct CameraLens {
+    distortion: LensDistortion,
+    /// Slopes (left, up) of the ray of each pixel of the image's tiles.
+    pub(super) rays: Arc<BentRays>,
+    /// Square of the largest slope in the image: beyond it the model may fold.
+    most2: f64,
+}
+
+impl CameraLens {
+    fn new(distortion: LensDistortion, [width, height]: [usize; 2], focal_px: f64) -> Self {
+        let tiles = [width.div_ceil(WIDTH), height.div_ceil(TILE_ROWS)];
+        let slope = |u: usize, v: usize| {
+            // Pixels beyond the edges are those at the edges: none of them is in the image.
+            let (u, v) = (u.min(width - 1), v.min(height - 1));
+            let x = (u as f64 + 0.5 - 0.5 * width as f64) / focal_px;
+            let y = (v as f64 + 0.5 - 0.5 * height as f64) / focal_px;
+            // Validated: a ray arrives at every pixel.
+            let [x, y] = distortion.undistorted([x, y]).unwrap_or([x, y]);
+            [-x, -y]
+        };
+        let mut most2 = 0.0_f64;
+        for v in 0..height {
+            for u in 0..width {
+                let [a, b] = slope(u, v);
+                most2 = most2.max(a * a + b * b);
+            }
+        }
+        Self {
+            distortion,
+            rays: Arc::new(BentRays::new(tiles, |u, v| slope(u, v).map(|part| part as f32))),
+            most2,
+        }
+    }
+
+    /// Slopes of a point as the lens shows it. Points outside the image move outwards along their direction, so that boxes end there.
+    pub(super) fn bent(&self, [a, b]: [f64; 2]) -> [f64; 2] {
+        let slope2 = a * a + b * b;
+        let shrink = if slope2 > self.most2 {
+            (self.most2 / slope2).sqrt()
+        } else {
+            1.0
+        };
+        let [x, y] = self.distortion.distorted([-a * shrink, -b * shrink]);
+        [-x / shrink, -y / shrink]
+    }
+}
+
 /// A camera's parameters in the form that the kernel uses.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct CameraOptics {
     pub(super) width: usize,
     pub(super) height: usize,
@@ -44,6 +99,8 @@ pub(super) struct CameraOptics {
     /// Longest ray, metres.
     pub(super) reach_m: f64,
     pub(super) mount: SensorMount,
+    /// The lens; `None` of a pinhole.
+    pub(super) lens: Option<CameraLens>,
     /// Planes through the pinhole, their normals of length 1 into the image: ahead, right, left, top, bottom.
     pub(super) frustum: [[f64; 3]; 5],
 }
@@ -54,7 +111,12 @@ impl CameraOptics {
         let (sin, cos) = libm::sincos(0.5 * params.horizontal_fov_deg.to_radians());
         let focal_px = 0.5 * width as f64 * cos / sin;
         let centre_px = [0.5 * width as f64, 0.5 * height as f64];
-        let [a, b] = centre_px.map(|half| half / focal_px);
+        let lens = (params.distortion != [0.0; 5])
+            .then(|| CameraLens::new(LensDistortion::new(params.distortion), [width, height], focal_px));
+        let [a, b] = match &lens {
+            None => centre_px.map(|half| half / focal_px),
+            Some(lens) => lens.rays.most().map(f64::from),
+        };
         let [by_a, by_b] = [a, b].map(|slope| 1.0 / (1.0 + slope * slope).sqrt());
         Self {
             width,
@@ -64,6 +126,7 @@ impl CameraOptics {
             range_m: params.range_m,
             reach_m: params.range_m * (1.0 + a * a + b * b).sqrt(),
             mount: SensorMount::new(params.mount),
+            lens,
             frustum: [
                 [1.0, 0.0, 0.0],
                 [a * by_a, by_a, 0.0],

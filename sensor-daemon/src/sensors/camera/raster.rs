@@ -9,6 +9,8 @@
 //! The image is a grid of tiles of sixteen columns and eight rows. Surfaces come nearest first, and a tile remembers its farthest pixel:
 //! most hidden surfaces are refused tile by tile (N. Greene, M. Kass and G. Miller, *Hierarchical Z-Buffer Visibility*, SIGGRAPH 1993).
 
+use std::sync::Arc;
+
 use crate::sensors::lidar::simd::{Floats, Simd, WIDTH, Words};
 
 /// Rows of a tile.
@@ -78,6 +80,78 @@ pub(super) struct Canvas {
     b_bounds: Vec<[f32; 2]>,
     /// Columns, rows and focal length that it has room for.
     pub(super) room: (usize, usize, f64),
+    /// The rays of a lens that bends them, in place of `a` and `b`.
+    pub(super) bent: Option<Arc<BentRays>>,
+}
+
+/// The rays of an image with lens distortion: a pair of slopes for each pixel. Surfaces are linear in these as in those of a pinhole, so
+/// the kernel finds what each ray hits, not what a pinhole's pixel nearby shows.
+#[derive(Debug)]
+pub(super) struct BentRays {
+    /// `a` and `b` by row of pixels, then sixteen columns each.
+    slopes: Vec<[Floats; 2]>,
+    /// Least and largest `a` and `b` of each tile.
+    bounds: Vec<[[f32; 2]; 2]>,
+    /// Those of each column of tiles and of each row of tiles.
+    column_bounds: Vec<[f32; 2]>,
+    row_bounds: Vec<[f32; 2]>,
+}
+
+impl BentRays {
+    /// From the slopes of each pixel, by column and row.
+    pub(super) fn new([tiles_x, tiles_y]: [usize; 2], slope: impl Fn(usize, usize) -> [f32; 2]) -> Self {
+        let none = [f32::INFINITY, f32::NEG_INFINITY];
+        let mut rays = Self {
+            slopes: vec![[Floats::ZERO; 2]; tiles_x * tiles_y * TILE_ROWS],
+            bounds: vec![[none; 2]; tiles_x * tiles_y],
+            column_bounds: vec![none; tiles_x],
+            row_bounds: vec![none; tiles_y],
+        };
+        let widen = |[low, high]: &mut [f32; 2], value: f32| (*low, *high) = (low.min(value), high.max(value));
+        for v in 0..tiles_y * TILE_ROWS {
+            for u in 0..tiles_x * WIDTH {
+                let (tile_x, tile_y) = (u / WIDTH, v / TILE_ROWS);
+                let [a, b] = slope(u, v);
+                let [to_a, to_b] = &mut rays.slopes[v * tiles_x + tile_x];
+                (to_a.0[u % WIDTH], to_b.0[u % WIDTH]) = (a, b);
+                let [a_bounds, b_bounds] = &mut rays.bounds[tile_y * tiles_x + tile_x];
+                widen(a_bounds, a);
+                widen(b_bounds, b);
+                widen(&mut rays.column_bounds[tile_x], a);
+                widen(&mut rays.row_bounds[tile_y], b);
+            }
+        }
+        rays
+    }
+
+    /// Largest size of `a` and of `b`.
+    pub(super) fn most(&self) -> [f32; 2] {
+        [&self.column_bounds, &self.row_bounds].map(|bounds| {
+            let sizes = bounds.iter().map(|[low, high]| low.abs().max(high.abs()));
+            sizes.fold(0.0, f32::max)
+        })
+    }
+
+    /// The tiles in which `a` and `b` may lie within these bounds; `None` if there are none.
+    pub(super) fn tiles(&self, a: [f64; 2], b: [f64; 2]) -> Option<TileRange> {
+        let among = |bounds: &[[f32; 2]], [low, high]: [f64; 2]| {
+            let overlaps = |of: &[f32; 2]| f64::from(of[1]) >= low - 1e-6 && f64::from(of[0]) <= high + 1e-6;
+            let first = bounds.iter().position(overlaps)?;
+            Some([first as u16, bounds.iter().rposition(overlaps)? as u16])
+        };
+        Some(TileRange {
+            x: among(&self.column_bounds, a)?,
+            y: among(&self.row_bounds, b)?,
+        })
+    }
+
+    /// All tiles.
+    pub(super) fn whole(&self) -> TileRange {
+        TileRange {
+            x: [0, self.column_bounds.len() as u16 - 1],
+            y: [0, self.row_bounds.len() as u16 - 1],
+        }
+    }
 }
 
 impl LinearForm {
@@ -131,6 +205,46 @@ impl Canvas {
         self.least.resize(tiles[0] * tiles[1], 0.0);
     }
 
+    /// `a` and `b` of sixteen pixels of a row.
+    #[inline(always)]
+    pub(super) fn rays<S: Simd>(&self, tile_x: usize, row: usize) -> [S::F; 2] {
+        match &self.bent {
+            None => [S::load(&self.a[tile_x]), S::splat(self.b[row])],
+            Some(rays) => rays.slopes[row * self.tiles[0] + tile_x].each_ref().map(S::load),
+        }
+    }
+
+    /// `a` and `b` of a pixel of a tile.
+    #[inline(always)]
+    pub(super) fn ray(&self, tile_x: usize, row: usize, element: usize) -> [f32; 2] {
+        match &self.bent {
+            None => [self.a[tile_x].0[element], self.b[row]],
+            Some(rays) => rays.slopes[row * self.tiles[0] + tile_x]
+                .each_ref()
+                .map(|slopes| slopes.0[element]),
+        }
+    }
+
+    /// Bounds of `a` and `b` in a tile.
+    #[inline(always)]
+    fn bounds(&self, [tile_x, tile_y]: [usize; 2]) -> [[f32; 2]; 2] {
+        match &self.bent {
+            None => [self.a_bounds[tile_x], self.b_bounds[tile_y]],
+            Some(rays) => rays.bounds[tile_y * self.tiles[0] + tile_x],
+        }
+    }
+
+    /// Largest size of `a` and of `b`.
+    fn most(&self) -> [f32; 2] {
+        match &self.bent {
+            None => [
+                self.a_bounds[0][1].max(-self.a_bounds[self.tiles[0] - 1][0]),
+                self.b[0].abs().max(self.b[self.b.len() - 1].abs()),
+            ],
+            Some(rays) => rays.most(),
+        }
+    }
+
     /// Fills the image with flat ground, of inverse depth `ground`, and with sky, `far` being the inverse depth of the end of the range.
     #[inline(always)]
     pub(super) fn fill<S: Simd>(&mut self, ground: Option<LinearForm>, far: f32) {
@@ -140,9 +254,9 @@ impl Canvas {
         let LinearForm(plane) = ground.unwrap_or(LinearForm([0.0; 3]));
         let [ground_word, sky_word] = [GROUND_SURFACE, SKY_SURFACE].map(|word| S::floats(S::splat_words(word)));
         for row in 0..self.b.len() {
-            let by_row = S::splat(self.b[row]) * S::splat(plane[2]);
             for tile in 0..tiles_x {
-                let inverse = LinearForm(plane).along::<S>(S::load(&self.a[tile])) + by_row;
+                let [a, b] = self.rays::<S>(tile, row);
+                let inverse = LinearForm(plane).along::<S>(a) + b * S::splat(plane[2]);
                 let is_ground = S::lt(sky, inverse);
                 let place = row * tiles_x + tile;
                 S::store(S::select(is_ground, inverse, sky), &mut self.inverse[place]);
@@ -155,7 +269,8 @@ impl Canvas {
         }
         for tile_y in 0..tiles_y {
             for tile_x in 0..tiles_x {
-                let [low, _] = LinearForm(plane).bounds(self.a_bounds[tile_x], self.b_bounds[tile_y]);
+                let [a, b] = self.bounds([tile_x, tile_y]);
+                let [low, _] = LinearForm(plane).bounds(a, b);
                 let low = low - LinearForm(plane).rounding(1.0, 1.0);
                 self.least[tile_y * tiles_x + tile_x] = low.max(far);
             }
@@ -185,21 +300,17 @@ impl Canvas {
 
     #[inline(always)]
     fn polygon<S: Simd>(&mut self, item: &DrawItem, inverse: LinearForm, edges: &[LinearForm]) {
-        let (a_most, b_most) = (
-            self.a_bounds[0][1].max(-self.a_bounds[self.tiles[0] - 1][0]),
-            self.b_most(),
-        );
+        let [a_most, b_most] = self.most();
         let rounding = inverse.rounding(a_most, b_most);
-        let mut tested = [[S::splat(0.0); 2]; MOST_EDGES];
+        let mut tested = [LinearForm::default(); MOST_EDGES];
         for tile_y in usize::from(item.tiles.y[0])..=usize::from(item.tiles.y[1]) {
             'tiles: for tile_x in usize::from(item.tiles.x[0])..=usize::from(item.tiles.x[1]) {
-                let (a_bounds, b_bounds) = (self.a_bounds[tile_x], self.b_bounds[tile_y]);
+                let [a_bounds, b_bounds] = self.bounds([tile_x, tile_y]);
                 let tile = tile_y * self.tiles[0] + tile_x;
                 let [_, nearest] = inverse.bounds(a_bounds, b_bounds);
                 if (nearest + rounding).min(item.most) <= self.least[tile] {
                     continue;
                 }
-                let a = S::load(&self.a[tile_x]);
                 let mut count = 0;
                 for edge in edges {
                     let [low, high] = edge.bounds(a_bounds, b_bounds);
@@ -208,18 +319,17 @@ impl Canvas {
                         continue 'tiles;
                     }
                     if low < rounding {
-                        tested[count] = [edge.along::<S>(a), S::splat(edge.0[2])];
+                        tested[count] = *edge;
                         count += 1;
                     }
                 }
-                let plane = [inverse.along::<S>(a), S::splat(inverse.0[2])];
-                self.least[tile] = self.tile::<S>([tile_x, tile_y], plane, &tested[..count], item.surface);
+                let (place, edges) = ([tile_x, tile_y], &tested[..count]);
+                self.least[tile] = match self.bent {
+                    None => self.tile::<S>(place, inverse, edges, item.surface),
+                    Some(_) => self.bent_tile::<S>(place, inverse, edges, item.surface),
+                };
             }
         }
-    }
-
-    fn b_most(&self) -> f32 {
-        self.b[0].abs().max(self.b[self.b.len() - 1].abs())
     }
 
     /// Draws a polygon into a tile and returns the tile's farthest pixel.
@@ -227,26 +337,64 @@ impl Canvas {
     fn tile<S: Simd>(
         &mut self,
         [tile_x, tile_y]: [usize; 2],
-        plane: [S::F; 2],
-        edges: &[[S::F; 2]],
+        inverse: LinearForm,
+        edges: &[LinearForm],
         surface: u32,
     ) -> f32 {
         let zero = S::splat(0.0);
+        // The part that all rows of the tile share.
+        let a = S::load(&self.a[tile_x]);
+        let mut shared = [[zero; 2]; MOST_EDGES];
+        for (shared, edge) in shared.iter_mut().zip(edges) {
+            *shared = [edge.along::<S>(a), S::splat(edge.0[2])];
+        }
+        let plane = [inverse.along::<S>(a), S::splat(inverse.0[2])];
         let mut least = S::splat(f32::NEG_INFINITY);
         for row in tile_y * TILE_ROWS..(tile_y + 1) * TILE_ROWS {
             let b = S::splat(self.b[row]);
             let place = row * self.tiles[0] + tile_x;
             let (inverse, before) = (plane[0] + b * plane[1], S::load(&self.inverse[place]));
             let mut mask = S::lt(before, inverse);
-            for [along, by_b] in edges {
+            for [along, by_b] in &shared[..edges.len()] {
                 mask = S::both(mask, S::le(zero, *along + b * *by_b));
             }
-            let now = S::select(mask, inverse, before);
-            S::store(now, &mut self.inverse[place]);
-            S::store_words_where(mask, surface, &mut self.surface[place]);
-            least = S::max(least, zero - now);
+            least = S::max(least, zero - self.nearer::<S>(place, mask, inverse, before, surface));
         }
         -S::largest(least)
+    }
+
+    /// As [`Canvas::tile`], with the rays of a lens.
+    #[inline(always)]
+    fn bent_tile<S: Simd>(
+        &mut self,
+        [tile_x, tile_y]: [usize; 2],
+        inverse: LinearForm,
+        edges: &[LinearForm],
+        surface: u32,
+    ) -> f32 {
+        let zero = S::splat(0.0);
+        let mut least = S::splat(f32::NEG_INFINITY);
+        for row in tile_y * TILE_ROWS..(tile_y + 1) * TILE_ROWS {
+            let [a, b] = self.rays::<S>(tile_x, row);
+            let place = row * self.tiles[0] + tile_x;
+            let at = |form: &LinearForm| form.along::<S>(a) + b * S::splat(form.0[2]);
+            let (inverse, before) = (at(&inverse), S::load(&self.inverse[place]));
+            let mut mask = S::lt(before, inverse);
+            for edge in edges {
+                mask = S::both(mask, S::le(zero, at(edge)));
+            }
+            least = S::max(least, zero - self.nearer::<S>(place, mask, inverse, before, surface));
+        }
+        -S::largest(least)
+    }
+
+    /// Sixteen pixels see a surface where `mask` says so. Returns their inverse depths.
+    #[inline(always)]
+    fn nearer<S: Simd>(&mut self, place: usize, mask: S::M, inverse: S::F, before: S::F, surface: u32) -> S::F {
+        let now = S::select(mask, inverse, before);
+        S::store(now, &mut self.inverse[place]);
+        S::store_words_where(mask, surface, &mut self.surface[place]);
+        now
     }
 
     #[inline(always)]
@@ -273,16 +421,12 @@ impl Canvas {
         let (cx, cy) = (S::splat(cylinder.centre_m[0]), S::splat(cylinder.centre_m[1]));
         let [low, high] = [S::splat(cylinder.z_m[0]), S::splat(cylinder.z_m[1])];
         let square_m2 = S::splat(cylinder.radius_m * cylinder.radius_m);
-        let a = S::load(&self.a[tile_x]);
-        let [along_x, along_y, along_z] = [axes[0].along::<S>(a), axes[1].along::<S>(a), axes[2].along::<S>(a)];
         let mut least = S::splat(f32::NEG_INFINITY);
         for row in tile_y * TILE_ROWS..(tile_y + 1) * TILE_ROWS {
-            let b = S::splat(self.b[row]);
+            let [a, b] = self.rays::<S>(tile_x, row);
             let place = row * self.tiles[0] + tile_x;
             // The ray in world axes.
-            let x = along_x + b * S::splat(axes[0].0[2]);
-            let y = along_y + b * S::splat(axes[1].0[2]);
-            let z = along_z + b * S::splat(axes[2].0[2]);
+            let [x, y, z] = [0, 1, 2].map(|i: usize| axes[i].along::<S>(a) + b * S::splat(axes[i].0[2]));
             let square = x * x + y * y;
             let (along, off) = (x * cx + y * cy, x * cy - y * cx);
             let root2 = square * square_m2 - off * off;

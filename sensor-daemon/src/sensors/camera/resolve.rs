@@ -190,7 +190,7 @@ impl Resolver<'_> {
         let [x_m, y_m, _] = self.view.pose.position_m;
         let origin = self.ground.place([x_m, y_m]);
         let per_m = S::splat(self.ground.cells_per_m() as f32);
-        let (a, b) = (S::load(&self.canvas.a[tile]), S::splat(self.canvas.b[row]));
+        let [a, b] = self.canvas.rays::<S>(tile, row);
         let mut cells = [Words::ZERO; 2];
         for (axis, cells) in cells.iter_mut().enumerate() {
             let ray = axes[axis].along::<S>(a) + b * S::splat(axes[axis].0[2]);
@@ -278,8 +278,7 @@ impl Resolver<'_> {
     /// Optical flow of the pixels of a tile's row.
     #[inline(always)]
     fn put_flow(&self, pixels: &Pixels, [tile, row]: [usize; 2], flow_px: &mut [[f32; 2]]) {
-        let focal_px = self.view.optics.focal_px as f32;
-        let b = self.canvas.b[row];
+        let optics = self.view.optics;
         for (element, to) in flow_px.iter_mut().enumerate() {
             let surface = pixels.surface.0[element];
             let seen = &self.surfaces.surfaces[surface as usize];
@@ -290,7 +289,7 @@ impl Resolver<'_> {
                 pixels.inverse.0[element]
             };
             *to = match self.motions.of(seen.user) {
-                Some(motion) => motion.flow_px([self.canvas.a[tile].0[element], b], inverse, focal_px),
+                Some(motion) => motion.flow_px(self.canvas.ray(tile, row, element), inverse, optics),
                 None => [f32::NAN; 2],
             };
         }

@@ -1,5 +1,7 @@
 //! A camera at one time: the world in its frame, and what of it lies in the image.
 
+use std::sync::Arc;
+
 use super::{
     optics::CameraOptics,
     raster::{Canvas, Cylinder, DrawItem, DrawShape, LinearForm, TILE_ROWS, TileRange},
@@ -100,14 +102,26 @@ impl CameraView<'_> {
         if far <= 0.0 || near >= optics.range_m {
             return None;
         }
+        let most = if near > NEAREST_M {
+            (1.0 / near) as f32 * 1.000_001
+        } else {
+            f32::INFINITY
+        };
         let whole = [[0.0, optics.width as f64 - 1.0], [0.0, optics.height as f64 - 1.0]];
         let mut pixels = whole;
-        if near > NEAREST_M {
+        if near <= NEAREST_M {
+            if let Some(lens) = &optics.lens {
+                return Some((lens.rays.whole(), most));
+            }
+        } else {
             let (mut a, mut b) = ([f64::INFINITY, f64::NEG_INFINITY], [f64::INFINITY, f64::NEG_INFINITY]);
             for [x, y, z] in corners {
                 let inverse = 1.0 / x;
                 let (y, z) = (y * inverse, z * inverse);
                 (a, b) = ([a[0].min(y), a[1].max(y)], [b[0].min(z), b[1].max(z)]);
+            }
+            if let Some(lens) = &optics.lens {
+                return Some((lens.rays.tiles(a, b)?, most));
             }
             let focal = optics.focal_px;
             let pixel =
@@ -121,11 +135,6 @@ impl CameraView<'_> {
             }
         }
         let tiles = |pixels: [f64; 2], size: usize| pixels.map(|pixel| (pixel as usize / size) as u16);
-        let most = if near > NEAREST_M {
-            (1.0 / near) as f32 * 1.000_001
-        } else {
-            f32::INFINITY
-        };
         let range = TileRange {
             x: tiles(pixels[0], WIDTH),
             y: tiles(pixels[1], TILE_ROWS),
@@ -213,6 +222,7 @@ impl DrawList {
 impl Canvas {
     /// Room for the image of a camera.
     pub(super) fn room_for(&mut self, optics: &CameraOptics) {
+        self.bent = optics.lens.as_ref().map(|lens| Arc::clone(&lens.rays));
         let room = (optics.width, optics.height, optics.focal_px);
         if self.room == room {
             return;

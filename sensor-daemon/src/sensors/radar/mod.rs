@@ -379,6 +379,7 @@ fn rays(radar: &RadarConfig) -> CameraParams {
         height: height.max(1),
         horizontal_fov_deg: radar.horizontal_fov_deg,
         range_m: radar.range_m,
+        distortion: [0.0; 5],
         mount: radar.mount,
     }
 }

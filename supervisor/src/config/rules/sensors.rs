@@ -1,7 +1,7 @@
 //! Rules of the sensors: rates divide each other, fields of view are not empty, and every observation field has its sensor.
 
 use ipc_schema::{
-    config::{Config, LidarConfig, LidarPattern, Network},
+    config::{Config, LidarConfig, LidarPattern, Network, SensorUnit},
     image::ImagePlane,
     sensor::{SENSORS, SensorKind, fitted_sensors},
 };
@@ -14,6 +14,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         .or_else(|| lidar(config))
         .or_else(|| observed_plane(config))
         .or_else(|| brightness_events(config))
+        .or_else(|| lens(config))
         .or_else(|| observation(config));
     match refused {
         None => Ok(()),
@@ -91,20 +92,42 @@ fn observed_plane(config: &Config) -> Option<BrokenSensorRule> {
     })
 }
 
+/// How messages name a camera.
+fn named(unit: &SensorUnit) -> String {
+    match unit.suite.as_str() {
+        "" => "`camera`".to_owned(),
+        suite => format!("camera `{}` of the suite `{suite}`", unit.name),
+    }
+}
+
+/// The lens of every camera shows something in every pixel.
+fn lens(config: &Config) -> Option<BrokenSensorRule> {
+    let units = config.sensor_units(SensorKind::Camera);
+    let (unit, [u, v]) = units
+        .iter()
+        .find_map(|unit| Some((unit, config.with_unit(unit).camera.folded_pixel()?)))?;
+    Some((
+        "camera.distortion",
+        format!(
+            "the distortion of {} folds within the image: no ray of a pinhole arrives at the pixel ({u}, {v})",
+            named(unit)
+        ),
+        "check the order k1, k2, p1, p2, k3; or make its horizontal_fov_deg smaller, for which the lens was calibrated"
+            .into(),
+    ))
+}
+
 /// A dynamic vision sensor samples at every tick.
 fn brightness_events(config: &Config) -> Option<BrokenSensorRule> {
     let units = config.sensor_units(SensorKind::Camera);
     let slow = units
         .iter()
         .find(|unit| unit.period_ticks != 1 && config.with_unit(unit).camera.events)?;
-    let camera = match slow.suite.as_str() {
-        "" => "`camera`".to_owned(),
-        suite => format!("camera `{}` of the suite `{suite}`", slow.name),
-    };
     Some((
         "camera.events",
         format!(
-            "{camera} has events, but takes an image every {} ticks only",
+            "{} has events, but takes an image every {} ticks only",
+            named(slow),
             slow.period_ticks
         ),
         format!(
