@@ -9,10 +9,13 @@ use ipc_schema::{
     observation::{EMPTY_SLOT, ObservationLayout},
     pointcloud::{LidarPoint, PointcloudLayout, Scan},
     prediction::PredictionLayout,
+    radar::{RadarDetection, RadarLayout, RadarScan},
     services::Channel,
     traffic::Kind,
     world::{VehicleState, WorldLayout},
 };
+
+mod image;
 
 /// Length of the header of a frame, bytes.
 pub const HEADER_BYTES: usize = size_of::<MessageHeader>();
@@ -20,8 +23,8 @@ pub const HEADER_BYTES: usize = size_of::<MessageHeader>();
 /// Longest frame, bytes. zenoh queues 16 batches of 64 KiB for each priority and drops a message that does not fit. On loopback, a third
 /// to a half of frames of 1.05 MB were lost, and none of 0.52 MB.
 pub const MAX_FRAME_BYTES: usize = 900_000;
-/// Longest frame of one scan, bytes: two fit into the queue.
-pub const MAX_SCAN_BYTES: usize = 480_000;
+/// Longest frame of one mounted sensor, bytes: two fit into the queue.
+pub const MAX_SENSOR_BYTES: usize = 480_000;
 
 /// A message cannot be framed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -32,6 +35,9 @@ pub enum FrameError {
     /// Longer than [`MAX_FRAME_BYTES`], and no row may be left out.
     #[error("a frame of {0} bytes is longer than the {MAX_FRAME_BYTES} bytes that a viewer's queue holds")]
     TooLong(usize),
+    /// The planes of an image do not have its size.
+    #[error("the planes of an image do not have the size that it names")]
+    Image,
 }
 
 /// A message as bytes for the network.
@@ -39,7 +45,7 @@ pub enum FrameError {
 pub struct EncodedFrame {
     /// Header and payload.
     pub bytes: Vec<u8>,
-    /// Rows left out so that the frame fits into a viewer's queue.
+    /// Rows, or bytes of an image's planes, that were left out so that the frame fits into a viewer's queue.
     pub left_out: usize,
 }
 
@@ -48,7 +54,7 @@ pub struct EncodedFrame {
 /// A frame of `world` has neither sub-steps nor views of heroes. If there are more road users or slots of an observation than fit, it has
 /// those that come first by [`sampling_order`], in every tick the same; of more points than fit, every second (third, …).
 /// A prediction and what is known from messages have the slots of their observation ([`encode_prediction`], [`encode_neighbours`]); alone,
-/// their first ones.
+/// their first ones. An image that does not fit has one plane, with fewer pixels if need be.
 ///
 /// # Errors
 /// The payload is shorter than its header promises, or the frame is too long.
@@ -61,7 +67,15 @@ pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Resul
         }
         Channel::Prediction => encode_prediction(header, payload, None),
         Channel::Neighbours => encode_neighbours(header, payload, None),
-        Channel::Pointcloud => encode_scan(header, payload),
+        Channel::Pointcloud => {
+            let layout = PointcloudLayout::of(header);
+            encode_returns::<Scan, LidarPoint>(header, payload, layout.scan, layout.points)
+        }
+        Channel::Radar => {
+            let layout = RadarLayout::of(header);
+            encode_returns::<RadarScan, RadarDetection>(header, payload, layout.scan, layout.detections)
+        }
+        Channel::Image => image::encode_image(header, payload),
         _ => encode_collisions(header, payload),
     }
 }
@@ -277,14 +291,16 @@ fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, 
     })
 }
 
-/// Encodes a scan: where the sensor was, and the points that fit.
-fn encode_scan(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let layout = PointcloudLayout::of(header);
-    let scan: &[Scan] = view(payload, layout.scan)?;
-    let points: &[LidarPoint] = view(payload, layout.points)?;
-    let mut head = bytemuck::cast_slice(scan).to_vec();
-    head.resize(layout.points.offset, 0);
-    Ok(thinned(header, &head, points, MAX_SCAN_BYTES))
+/// Encodes a scan: where the sensor was (`S`), and the returns (`R`) that fit.
+fn encode_returns<S: bytemuck::Pod, R: bytemuck::Pod>(
+    header: &MessageHeader,
+    payload: &[u8],
+    scan: Section,
+    returns: Section,
+) -> Result<EncodedFrame, FrameError> {
+    let mut head = bytemuck::cast_slice(view::<S>(payload, scan)?).to_vec();
+    head.resize(returns.offset, 0);
+    Ok(thinned(header, &head, view::<R>(payload, returns)?, MAX_SENSOR_BYTES))
 }
 
 /// Header, `head`, and every row, or every second (third, …) so that the frame has at most `max_bytes`.

@@ -4,10 +4,12 @@ use ipc_schema::{
     SCHEMA_VERSION,
     event::Collision,
     header::MessageHeader,
+    image::ImageLayout,
     neighbours::NeighboursLayout,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::PredictionLayout,
+    radar::RadarLayout,
     traffic::{RoutePoint, SignalMeta, VehicleMeta},
     world::VehicleState,
 };
@@ -87,11 +89,16 @@ fn promised(topic: &str, header: &MessageHeader) -> Option<usize> {
         "prediction" => PredictionLayout::of(header).len,
         "observation" => ObservationLayout::of(header).len,
         "neighbours" => NeighboursLayout::of(header).len,
-        topic if topic.starts_with("pointcloud/") => {
-            let layout = PointcloudLayout::of(header);
-            layout.points.offset.saturating_add(layout.points.len)
+        topic => {
+            // The last section of what a mounted sensor sends.
+            let last = match topic.split_once('/')?.0 {
+                "pointcloud" => PointcloudLayout::of(header).points,
+                "image" => ImageLayout::of(header).objects,
+                "radar" => RadarLayout::of(header).detections,
+                _ => return None,
+            };
+            last.offset.saturating_add(last.len)
         }
-        _ => return None,
     })
 }
 
@@ -101,7 +108,7 @@ mod tests {
 
     use super::*;
 
-    const TOPICS: [&str; 11] = [
+    const TOPICS: [&str; 13] = [
         "map",
         "status",
         "vehicles",
@@ -112,6 +119,8 @@ mod tests {
         "neighbours",
         "event",
         "pointcloud/a",
+        "image/a@front",
+        "radar/a",
         "other",
     ];
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use ipc_schema::{
     activity::Activity,
     board::{Health, State, TrainingStatus},
-    config::Field,
+    config::{Field, SensorUnit},
     process::Process,
     run::{MapInfo, Mode, RunFile},
 };
@@ -34,6 +34,8 @@ struct MapDocument<'a> {
     observation_fields: &'a [Field],
     rates_hz: BTreeMap<&'static str, f64>,
     lidar: Value,
+    sensor_units: Vec<SensorUnit>,
+    roadsides: Vec<Value>,
 }
 
 /// The run's identity as text, because JSON has no integers of 64 bits.
@@ -48,6 +50,7 @@ pub fn run_id_text(run: &RunFile) -> String {
 /// A value has no form in JSON.
 pub fn map_json(run: &RunFile, env: u32) -> Result<String, serde_json::Error> {
     let (fanout, lidar) = (&run.config.fanout, &run.config.lidar);
+    let roadsides = run.config.roadsides.iter();
     let map = MapDocument {
         schema_version: run.schema_version,
         run: &run.name,
@@ -66,12 +69,18 @@ pub fn map_json(run: &RunFile, env: u32) -> Result<String, serde_json::Error> {
             ("prediction", fanout.prediction_hz),
             ("neighbours", fanout.neighbours_hz),
             ("pointcloud", fanout.pointcloud_hz),
+            ("image", fanout.image_hz),
+            ("radar", fanout.radar_hz),
             ("event", fanout.event_hz),
             ("signals", fanout.signals_hz),
             ("vehicles", fanout.vehicles_hz),
             ("status", fanout.status_hz),
         ]),
         lidar: json!({ "vehicles": lidar.vehicles, "range_m": lidar.range_m, "mode": lidar.mode }),
+        sensor_units: run.config.all_sensor_units(),
+        roadsides: roadsides
+            .map(|roadside| json!({ "name": roadside.name, "suite": roadside.suite }))
+            .collect(),
     };
     let text = serde_json::to_string(&map)?;
     // The scene of a large net has many megabytes, so its text is inserted without parsing it into values.
@@ -164,8 +173,10 @@ pub struct FanoutCounters {
     pub oversize_frames: u64,
     /// Sets after which the rate was lowered because a frame was long.
     pub slowed_sets: u64,
-    /// Scans of vehicles whose id was not known yet.
-    pub unnamed_scans: u64,
+    /// Images that were sent with fewer planes or pixels, because they were too long.
+    pub reduced_images: u64,
+    /// Messages of mounted sensors whose carrier's id was not known yet.
+    pub unnamed_messages: u64,
     /// Commands from the network that were refused.
     pub refused_commands: u64,
     /// Connections that were refused.
@@ -184,7 +195,7 @@ impl FanoutCounters {
     /// Counts a message that is not published, and logs the first.
     pub fn refuse(&mut self, topic: &'static str, error: &FrameError) {
         let counter = match error {
-            FrameError::Block(_) => &mut self.refused_messages,
+            FrameError::Block(_) | FrameError::Image => &mut self.refused_messages,
             FrameError::TooLong(_) => &mut self.oversize_frames,
         };
         *counter += 1;

@@ -360,18 +360,18 @@ fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
 
     // Without a subscriber no scan is published; with one, its scans are.
     send_scan(&sensors, &scans, 1, (IDS[1], 1), 50);
-    let wanted = watch(&late, run.scan_key(IDS[1]));
+    let wanted = watch(&late, run.sensor_key(Channel::Pointcloud, IDS[1]));
     let mut tick = 1;
     until("a scan", || {
         tick += 1;
         send_scan(&sensors, &scans, tick, (IDS[2], 2), 50);
         send_scan(&sensors, &scans, tick, (IDS[1], 1), 50);
-        ask(&late, &run.scan_key(IDS[1])).is_some()
+        ask(&late, &run.sensor_key(Channel::Pointcloud, IDS[1])).is_some()
     });
     let (header, payload) = next(&wanted);
     let scan: Scan = pod_read_unaligned(&payload[..size_of::<Scan>()]);
     assert_eq!((header.rows(), scan.vehicle, scan.id_hash), (50, 1, id_hash(IDS[1])));
-    assert!(ask(&late, &run.scan_key(IDS[2])).is_none());
+    assert!(ask(&late, &run.sensor_key(Channel::Pointcloud, IDS[2])).is_none());
 }
 
 /// A viewer that joins late gets the course of training from its start, also after the fan-out was killed; later updates follow.
@@ -445,7 +445,7 @@ fn garbage_is_counted_and_not_fatal() {
     let keys: Vec<String> = keys
         .chain([
             run.alive_key(),
-            run.scan_key("x"),
+            run.sensor_key(Channel::Pointcloud, "x"),
             format!("{}/x/y", run.key(Topic::World)),
         ])
         .collect();

@@ -17,12 +17,14 @@ use ipc_schema::{
     services::Channel,
 };
 
-const TOPICS: [&str; 15] = [
+const TOPICS: [&str; 17] = [
     "world",
     "observation",
     "prediction",
     "neighbours",
     "pointcloud/cav.1",
+    "image/cav.1",
+    "radar/cav.1@front",
     "pointcloud",
     "event",
     "collision",

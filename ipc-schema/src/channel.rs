@@ -380,7 +380,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         required: &[],
         paced_by: Channel::Observation,
         window: RunFile::window_ticks,
-        topics: &[],
+        topics: &["image"],
         when_full: FullQueue::DropOldest,
         max_payload: |run| {
             of_units(run, SensorKind::Camera, |config| {
@@ -403,7 +403,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         required: &[],
         paced_by: Channel::Observation,
         window: RunFile::window_ticks,
-        topics: &[],
+        topics: &["radar"],
         when_full: FullQueue::DropOldest,
         max_payload: |_| RadarLayout::new(MOST_DETECTIONS).len,
         // The messages of one tick.
@@ -570,12 +570,17 @@ impl Channel {
         let fanned_out = usize::from(run.config.fanout.enabled && !spec.topics.is_empty());
         let watching = usize::from(self == Self::World && run.config.trainer.road_users);
         let subscribers = required + fanned_out + watching;
+        // Where the newest messages win, all queues hold the same ones: those sent last.
+        let queues = match spec.when_full {
+            FullQueue::DropNewest => subscribers,
+            FullQueue::DropOldest => 1,
+        };
         // A recorder copies each message as it comes, so it has one in hand.
         let recorded = match run.config.record.records(self) {
             true => (spec.queue_length)(run) + 1,
             false => 0,
         };
-        subscribers * ((spec.queue_length)(run) + (spec.in_hand)(run)) + recorded + SPARE_MESSAGES
+        queues * (spec.queue_length)(run) + subscribers * (spec.in_hand)(run) + recorded + SPARE_MESSAGES
     }
 }
 

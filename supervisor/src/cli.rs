@@ -329,6 +329,7 @@ const VIEW: &str = "Examples:
   caraware view --save run.rrd           record; open it later with `.venv/bin/rerun run.rrd`
   caraware view town-2                   show one of several runs
   caraware view --vehicle cav.3 --lidar all
+  caraware view --camera cav.3@front --radar cav.3
   caraware view --messages               what a vehicle knows from V2X messages, and its links
   caraware view tcp/127.0.0.1:7448       connect to an endpoint (`fanout.listen` of a run)
 
@@ -351,12 +352,18 @@ pub struct ViewArgs {
     /// Record to a file; with --web, in addition to the browser
     #[arg(long, value_name = "F.rrd")]
     pub save: Option<PathBuf>,
-    /// A vehicle to show (repeatable): figures and point cloud; the first is in the 3-D view
+    /// A vehicle to show (repeatable): figures and point cloud; the first is in the 3-D view, with its camera and radar
     #[arg(long, value_name = "ID")]
     pub vehicle: Vec<String>,
     /// Points of the LIDARs: those on road users, with the range ring (interest); all; or none (off) [default: interest]
     #[arg(long, value_parser = ["interest", "all", "off"])]
     pub lidar: Option<String>,
+    /// A camera to show beside the 3-D view (repeatable), by its carrier, with @ and its name if it is a suite's; or "off" [default: that of the followed vehicle]
+    #[arg(long, value_name = "ID[@SENSOR]")]
+    pub camera: Vec<String>,
+    /// A radar to show in the 3-D view (repeatable), in the same way; or "off" [default: that of the followed vehicle]
+    #[arg(long, value_name = "ID[@SENSOR]")]
+    pub radar: Vec<String>,
     /// What the followed vehicle knows from V2X messages, its links, and which stations have just sent
     #[arg(long)]
     pub messages: bool,

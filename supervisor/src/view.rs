@@ -41,6 +41,8 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     command.args(args.save.as_ref().map(|path| format!("--save={}", path.display())));
     command.args(args.vehicle.iter().map(|id| format!("--vehicle={id}")));
     command.args(args.lidar.as_ref().map(|points| format!("--lidar={points}")));
+    command.args(args.camera.iter().map(|name| format!("--camera={name}")));
+    command.args(args.radar.iter().map(|name| format!("--radar={name}")));
     command.args(args.messages.then_some("--messages"));
     if let Some(name) = &args.run {
         command.arg(format!("--run={name}"));

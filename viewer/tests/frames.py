@@ -127,3 +127,36 @@ def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
         rows[name] = value
     payload = head.tobytes() + bytes(-wire.SCAN.itemsize % layout.ALIGNMENT) + rows.tobytes()
     return header(tick, len(rows), 1) + payload
+
+
+def image(tick: int, pixels: dict[str, np.ndarray], objects: Sequence[dict[str, Any]] = (), **head: Any) -> bytes:
+    """An image with these planes `[h, w]` or `[h, w, 3]`, and the road users in it."""
+    names = [name for name, _, _ in wire.PLANES]
+    height, width = next(iter(pixels.values())).shape[:2]
+    row = np.zeros(1, wire.IMAGE_HEAD)
+    row["height"], row["width"], row["range_m"] = height, width, 100.0
+    row["planes"] = sum(1 << names.index(name) for name in pixels)
+    for name, value in head.items():
+        row[name] = value
+    content = b"".join(np.asarray(pixels[name], scalar).tobytes() for name, scalar, _ in wire.PLANES if name in pixels)
+    rows = np.zeros(len(objects), wire.SEEN_OBJECT)
+    for seen, values in zip(rows, objects, strict=True):
+        for name, value in values.items():
+            seen[name] = value
+    return header(tick, len(objects), 1, len(content)) + padded(row.tobytes()) + padded(content) + rows.tobytes()
+
+
+def radar(tick: int, detections: dict[str, Any], **scan: Any) -> bytes:
+    """A scan with these columns of detections."""
+    head = np.zeros(1, wire.RADAR_SCAN)
+    for name, value in scan.items():
+        head[name] = value
+    rows = np.zeros(len(next(iter(detections.values()))), wire.RADAR_DETECTION)
+    for name, value in detections.items():
+        rows[name] = value
+    return header(tick, len(rows), 1) + padded(head.tobytes()) + rows.tobytes()
+
+
+def padded(section: bytes) -> bytes:
+    """A section up to where the next one begins."""
+    return section + bytes(-len(section) % layout.ALIGNMENT)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from ports import free_port
 
-from caraware_viewer import course, plots, scene, space, static_map, top, views
+from caraware_viewer import course, plots, scene, sights, space, static_map, top, views
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
@@ -330,3 +330,55 @@ def check_recording(path: Path) -> None:
     assert backgrounds == {top.rgba(views.BACKGROUND)}
     factor = [row["Scalars:scalars"][0] for _, row in found[plots.REAL_TIME].rows if "Scalars:scalars" in row]
     assert 0.5 < np.median(factor) < 1.5
+
+
+def cameras_of(picture: Picture) -> Picture:
+    """The column of images. With it the blueprint's columns are as 5 : 3.4 : 2.6 : 2.6."""
+    return part(picture, 8.4 / 13.6, 11 / 13.6)
+
+
+def without_sights(picture: Picture) -> list[str]:
+    """What the picture does not show of a camera."""
+    shown = cameras_of(picture)[~of_color(cameras_of(picture), views.BACKGROUND, 12)]
+    seen = {
+        "an image": len(shown) > 8_000,
+        "colours of an image": len(np.unique(shown // 32, axis=0)) > 8,
+        "3-D view beside it": (part(picture, 5 / 13.6, 8.4 / 13.6, 0.52, 0.95).std(axis=(0, 1)) > 5).any(),
+    }
+    return [what for what, there in seen.items() if not there]
+
+
+def test_a_browser_shows_what_the_sensors_of_the_followed_vehicle_see(runs: Path, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    settings = ("suite=paper:4", "fanout.image_hz=2", "fanout.radar_hz=2", f"fanout.listen={endpoint}", *SETTINGS)
+    run = [str(COMMAND), "simulate", "town", *(part for setting in settings for part in ("--set", setting))]
+    recorded = tmp_path / "run.rrd"
+    view = [str(COMMAND), "view", endpoint, "--web", "--web-port", str(free_port()), "--save", str(recorded)]
+    with started([*run, "--runs", str(runs)], tmp_path / "run.log", environment()) as running:
+        wait_for_line(tmp_path / "run.log", READY["simulate"], running, 300)
+        refused = subprocess.run(
+            [str(COMMAND), "view", endpoint, "--save", str(tmp_path / "none.rrd"), "--camera", "cav.0@rear"],
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert refused.returncode == 1, refused.stderr
+        assert "--camera cav.0@rear: there is no such camera; names behind the id: @camera" in refused.stderr
+        with started(view, tmp_path / "view.log", environment()) as viewing:
+            url = wait_for_line(tmp_path / "view.log", r"open (http://\S+) in a browser", viewing, 120)
+            with Browser(*SIZE) as browser:
+                browser.open(f"{url}?renderer=webgl")
+                browser.wait_for("window._handle !== undefined", 180)
+                picture = wait_for_picture(browser, without_sights, "not in the picture")
+        assert viewing.returncode == 130, (tmp_path / "view.log").read_text()
+    if PICTURE and PICTURE_MODE == "sights":
+        Image.fromarray(picture).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
+    found = recordings.read(recorded)
+    images = [row["Image:format"][0] for _, row in found[f"{sights.OF_FOLLOWED}/image"].rows if row.get("Image:format")]
+    assert {(image["width"], image["height"]) for image in images} == {(84, 84)} and len(images) >= 2
+    assert found[f"{sights.OF_FOLLOWED}/boxes"].rows
+    detected = [row["Points3D:positions"] for _, row in found[space.RADAR].rows if row.get("Points3D:positions")]
+    assert detected and np.isfinite(np.array(detected[-1])).all()
+    names = {name for value in recordings.layouts(recorded)["ViewBlueprint:display_name"] for name in value}
+    assert "Camera of the followed vehicle" in names

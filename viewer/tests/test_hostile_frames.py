@@ -26,6 +26,8 @@ DECODERS: list[tuple[Callable[[bytes], object], bytes]] = [
     (wire.decode_prediction, frames.prediction(0, TRUTH, TRUTH)),
     (wire.decode_neighbours, frames.neighbours(3, {0: [([1.0] * 11, (5, 6, 1))], 1: []})),
     (wire.decode_cloud, frames.pointcloud(3, {"position_m": np.zeros((3, 3)), "tag": [0, 4, 6]})),
+    (wire.decode_image, frames.image(3, {"rgb": np.zeros((4, 5, 3)), "depth_m": np.ones((4, 5))}, [{"object": 3}])),
+    (wire.decode_detections, frames.radar(3, {"distance_m": [1.0, 2.0]})),
     (lambda frame: wire.decode_table(frame, wire.VEHICLE_META), frames.vehicles(3, {5: "a", 6: "b"})),
     (lambda frame: wire.decode_table(frame, wire.SIGNAL_META), frames.signals(3, {9: "rGy"})),
     (lambda frame: wire.decode_table(frame, wire.COLLISION), frames.event(3, np.zeros((2, 3)))),

@@ -261,7 +261,7 @@ def test_a_cloud_is_drawn_in_the_world_with_its_range(drawn: Drawn) -> None:
         ("pointcloud/other", frames.pointcloud(1, points, id_hash=100)),
     ]
     drawing, found = drawn(*samples, wanted=["x/y"])
-    assert drawing.cloud_vehicles() == ["x/y"]
+    assert "pointcloud/x%2Fy" in drawing.sensor_topics()
     near(found[top.CLOUD], "Points2D:positions", [[15, -50]])
     near(found[space.CLOUD], "Points3D:positions", [[15, 50, 2]])
     ring = np.array(found[top.RING].newest("LineStrips2D:strips")[0])
@@ -269,7 +269,7 @@ def test_a_cloud_is_drawn_in_the_world_with_its_range(drawn: Drawn) -> None:
     _, whole = drawn(*samples, wanted=["x/y"], lidar="all")
     assert len(whole[top.CLOUD].newest("Points2D:positions")) == 2
     drawing, _ = drawn(*samples[:2], wanted=["x/y"], lidar="off")
-    assert drawing.cloud_vehicles() == []
+    assert not [topic for topic in drawing.sensor_topics() if "pointcloud" in topic]
 
 
 def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
@@ -348,7 +348,7 @@ def test_a_vehicle_with_a_radio_is_followed_where_messages_are_shown(drawn: Draw
     radio = np.array([[0, 0, 0, 0, 0], [1, 0, 0, 0, 0]])
     frame = frames.neighbours(4, {0: [], 1: []}, radio=radio)
     scene, _ = drawn(("world", world), ("neighbours", frame), messages=True)
-    assert scene.cloud_vehicles() == [] and scene.followed == [101]
+    assert scene.sensor_topics() == set() and scene.followed == [101]
     scene, _ = drawn(("world", world))
     assert scene.followed == [100]
     scene, _ = drawn(

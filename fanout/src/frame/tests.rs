@@ -1,7 +1,11 @@
 use std::collections::BTreeSet;
 
 use bytemuck::{cast_slice, cast_slice_mut};
-use ipc_schema::traffic::id_hash;
+use ipc_schema::{
+    block::view_mut,
+    image::{ImageHead, ImageLayout, ImagePlane, SeenObject},
+    traffic::id_hash,
+};
 use proptest::prelude::*;
 
 use super::*;
@@ -183,9 +187,138 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
     let frame = encode(Channel::Pointcloud, &header(layout.shape), bytes).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
     let kept = head.rows();
-    assert!(frame.bytes.len() <= MAX_SCAN_BYTES && kept + frame.left_out == 40_000 && kept > 13_000);
+    assert!(frame.bytes.len() <= MAX_SENSOR_BYTES && kept + frame.left_out == 40_000 && kept > 13_000);
     assert_eq!(pod_read_unaligned::<Scan>(&body[..size_of::<Scan>()]), scan);
     assert_eq!(body.len(), layout.points.offset + kept * size_of::<LidarPoint>());
+}
+
+/// An image of `width` × `height` pixels with these planes, whose bytes are numbered, and one road user in columns 600 to 900.
+fn image(width: u32, height: u32, planes: &[ImagePlane]) -> (ImageLayout, Vec<u64>) {
+    let bytes_of_planes: usize = planes.iter().map(|plane| plane.pixel_bytes()).sum();
+    let layout = ImageLayout::new(1, bytes_of_planes * (width * height) as usize);
+    let mut words = payload(layout.len);
+    let bytes: &mut [u8] = cast_slice_mut(&mut words);
+    view_mut::<ImageHead>(bytes, layout.head).unwrap()[0] = ImageHead {
+        id_hash: 9,
+        width,
+        height,
+        planes: planes.iter().map(|plane| plane.bit()).sum(),
+        focal_px: 600.0,
+        range_m: 150.0,
+        ..ImageHead::default()
+    };
+    view_mut::<SeenObject>(bytes, layout.objects).unwrap()[0] = SeenObject {
+        object: 7,
+        visible_px: 9_000,
+        visible_box_px: [600, 30, 900, 60],
+        full_box_px: [-30.0, 30.0, 900.0, 61.5],
+        depth_m: [20.0, 24.0],
+        ..SeenObject::default()
+    };
+    (layout, words)
+}
+
+#[test]
+fn an_image_that_fits_goes_out_as_it_is() {
+    let (layout, words) = image(84, 84, &ImagePlane::ALL);
+    let bytes: &[u8] = cast_slice(&words);
+    let frame = encode(Channel::Image, &header(layout.shape), bytes).unwrap();
+    assert_eq!(
+        decode(&frame.bytes).unwrap(),
+        (header(layout.shape), &bytes[..layout.len])
+    );
+    assert_eq!(frame.left_out, 0);
+}
+
+/// Of a large image one plane remains, and of that the pixel amid each block; whatever is in pixels is in those of the frame's image.
+#[test]
+fn an_image_that_does_not_fit_has_one_plane_and_fewer_pixels() {
+    use ImagePlane::{Binary, Depth, Instance, Rgb, Semantic};
+    for (planes, kept, before, factor) in [
+        (&ImagePlane::ALL[..], Rgb, 9, 2),
+        (&[Depth, Instance, Semantic], Semantic, 8, 1),
+        (&[Depth, Instance, Binary], Depth, 0, 2),
+        (&[Instance, Binary], Binary, 4, 1),
+        (&[Instance], Instance, 0, 2),
+    ] {
+        let (width, height) = (1_001, 435);
+        let (layout, words) = image(width, height, planes);
+        let bytes: &[u8] = cast_slice(&words);
+        let frame = encode(Channel::Image, &header(layout.shape), bytes).unwrap();
+        assert!(frame.bytes.len() <= MAX_SENSOR_BYTES);
+        let (head, body) = decode(&frame.bytes).unwrap();
+        let found = ImageLayout::of(&head);
+        let shown: ImageHead = pod_read_unaligned(&body[..size_of::<ImageHead>()]);
+        assert_eq!(
+            (shown.width, shown.height, shown.planes),
+            (width / factor, height / factor, kept.bit())
+        );
+        assert_eq!(
+            (shown.id_hash, shown.focal_px, shown.range_m),
+            (9, 600.0 / factor as f32, 150.0)
+        );
+        // Pixel by pixel.
+        let pixel = kept.pixel_bytes();
+        let whole = &bytes[layout.planes.offset + before * (width * height) as usize..];
+        let pixels = &body[found.planes.offset..found.planes.offset + found.planes.len];
+        assert_eq!(pixels.len(), (shown.width * shown.height) as usize * pixel);
+        assert_eq!(frame.left_out, layout.planes.len - pixels.len());
+        for (index, value) in pixels.chunks_exact(pixel).enumerate() {
+            let (row, column) = (index as u32 / shown.width, index as u32 % shown.width);
+            let place = (row * factor + factor / 2) * width + column * factor + factor / 2;
+            assert_eq!(
+                value,
+                &whole[place as usize * pixel..][..pixel],
+                "{planes:?} {row} {column}"
+            );
+        }
+        // The road user.
+        let object: SeenObject = pod_read_unaligned(&body[found.objects.offset..][..size_of::<SeenObject>()]);
+        let factor_px = factor as u16;
+        assert_eq!(
+            object.visible_box_px,
+            [600, 30, 900, 60].map(|edge: u16| edge / factor_px)
+        );
+        assert_eq!(
+            object.full_box_px,
+            [-30.0, 30.0, 900.0, 61.5].map(|edge: f32| edge / factor as f32)
+        );
+        assert_eq!((object.object, object.depth_m), (7, [20.0, 24.0]));
+        assert_eq!(object.visible_px, 9_000 / (factor * factor));
+    }
+}
+
+#[test]
+fn an_image_whose_planes_do_not_have_its_size_is_refused() {
+    let planes = [ImagePlane::Rgb, ImagePlane::Semantic];
+    for change in [
+        |head: &mut ImageHead| head.width += 1,
+        |head: &mut ImageHead| head.height = u32::MAX,
+        |head: &mut ImageHead| head.planes |= ImagePlane::Depth.bit(),
+        |head: &mut ImageHead| head.planes = 0,
+    ] {
+        let (layout, mut words) = image(40, 30, &planes);
+        let bytes: &mut [u8] = cast_slice_mut(&mut words);
+        change(&mut view_mut::<ImageHead>(bytes, layout.head).unwrap()[0]);
+        assert_eq!(
+            encode(Channel::Image, &header(layout.shape), bytes),
+            Err(FrameError::Image)
+        );
+    }
+}
+
+#[test]
+fn the_detections_of_a_radar_go_out_as_they_are() {
+    let layout = RadarLayout::new(ipc_schema::radar::MOST_DETECTIONS);
+    let words = payload(layout.len);
+    let bytes = &cast_slice::<_, u8>(&words)[..layout.detections.offset + layout.detections.len];
+    let frame = encode(Channel::Radar, &header(layout.shape), cast_slice(&words)).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    assert_eq!(
+        (head, &body[..size_of::<RadarScan>()]),
+        (header(layout.shape), &bytes[..size_of::<RadarScan>()])
+    );
+    assert_eq!(body[layout.detections.offset..], bytes[layout.detections.offset..]);
 }
 
 /// The frame holds as many slots as fit.
@@ -213,6 +346,8 @@ fn a_header_that_promises_too_much_is_refused() {
         Channel::Prediction,
         Channel::Event,
         Channel::Pointcloud,
+        Channel::Image,
+        Channel::Radar,
     ] {
         for columns in [1, 9, u32::MAX] {
             for more in [0, 1, u32::MAX] {

@@ -6,7 +6,7 @@ use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 /// Characters that are encoded: all but RFC 3986's unreserved ones.
 const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
-/// What is published under a run's prefix; each vehicle's scans have their own key ([`RunKeys::scan`]).
+/// What is published under a run's prefix; each mounted sensor has its own key ([`RunKeys::sensor`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Topic {
     /// The scene and the tick, as JSON; answers queries only.
@@ -110,10 +110,16 @@ impl RunKeys {
         format!("caraware-control{}", &self.prefix["caraware".len()..])
     }
 
-    /// Key of the scans of the vehicle with this SUMO id.
+    /// Key of what `channel` carries of one mounted sensor: `name` is its carrier's id, with `@` and the sensor's name if it is of a suite.
     #[must_use]
-    pub fn scan(&self, id: &str) -> String {
-        format!("{}/{}/{}", self.prefix, Channel::Pointcloud.name(), encode(id))
+    pub fn sensor(&self, channel: Channel, name: &str) -> String {
+        format!("{}/{}/{}", self.prefix, channel.name(), encode(name))
+    }
+
+    /// Key expression over [`RunKeys::sensor`] of every sensor.
+    #[must_use]
+    pub fn every_sensor(&self, channel: Channel) -> String {
+        format!("{}/{}/*", self.prefix, channel.name())
     }
 
     /// Key expression over all of these.
@@ -133,12 +139,15 @@ mod tests {
     use proptest::prelude::*;
     use zenoh::key_expr::KeyExpr;
 
-    /// The topics of the channels are those that a run publishes, beside `map`, `status`, `learning` and the scans.
+    /// The topics of the channels are those that a run publishes, beside `map`, `status`, `learning` and the mounted sensors.
     #[test]
     fn every_topic_of_a_channel_is_published() {
         let of_channels: BTreeSet<&str> = CHANNELS.iter().flat_map(|channel| channel.topics).copied().collect();
         let names = Topic::ALL.map(Topic::name);
-        let published: BTreeSet<&str> = names.into_iter().chain([Channel::Pointcloud.name()]).collect();
+        let published: BTreeSet<&str> = names
+            .into_iter()
+            .chain([Channel::Pointcloud, Channel::Image, Channel::Radar].map(Channel::name))
+            .collect();
         let of_the_run = BTreeSet::from([Topic::Map, Topic::Status, Topic::Learning].map(Topic::name));
         assert_eq!(&published - &of_the_run, of_channels);
     }
@@ -167,7 +176,8 @@ mod tests {
                 prop_assert!(KeyExpr::new(keys.all()).is_ok_and(|all| all.includes(&KeyExpr::new(key.as_str()).unwrap())));
                 prop_assert_eq!(key.split('/').count(), 4);
             }
-            let scan = keys.scan(&name);
+            let scan = keys.sensor(Channel::Pointcloud, &name);
+            prop_assert!(KeyExpr::new(keys.every_sensor(Channel::Pointcloud)).is_ok_and(|all| all.includes(&KeyExpr::new(scan.as_str()).unwrap())));
             prop_assert!(KeyExpr::new(scan.as_str()).is_ok_and(|k| k.as_str() == scan && !k.is_wild()), "{}", scan);
             prop_assert!(KeyExpr::new(keys.all()).is_ok_and(|all| all.includes(&KeyExpr::new(scan.as_str()).unwrap())));
             prop_assert_eq!(scan.split('/').count(), 5);

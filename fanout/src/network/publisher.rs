@@ -10,6 +10,7 @@ use std::{
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
+use ipc_schema::services::Channel;
 use zenoh::{
     Wait,
     bytes::{Encoding, ZBytes},
@@ -130,16 +131,24 @@ impl EnvironmentPublisher {
         Ok(self)
     }
 
-    /// Declares the key of one vehicle's scans.
+    /// Declares the key of what `channel` carries of the mounted sensor with this name ([`RunKeys::sensor`]).
     ///
     /// # Errors
     /// zenoh refuses.
-    pub fn declare_scan(&self, id: &str) -> Result<KeyPublisher, NetworkError> {
-        self.declare_key(
-            &self.keys.scan(id),
-            Encoding::APPLICATION_OCTET_STREAM,
-            Priority::Background,
-        )
+    pub fn declare_sensor(&self, channel: Channel, name: &str) -> Result<KeyPublisher, NetworkError> {
+        self.declare_sensor_key(&self.keys.sensor(channel, name))
+    }
+
+    /// Declares an expression over the keys of all sensors of `channel`, to be asked for subscribers.
+    ///
+    /// # Errors
+    /// zenoh refuses.
+    pub fn declare_every_sensor(&self, channel: Channel) -> Result<KeyPublisher, NetworkError> {
+        self.declare_sensor_key(&self.keys.every_sensor(channel))
+    }
+
+    fn declare_sensor_key(&self, key: &str) -> Result<KeyPublisher, NetworkError> {
+        self.declare_key(key, Encoding::APPLICATION_OCTET_STREAM, Priority::Background)
     }
 
     fn declare_key(&self, key: &str, encoding: Encoding, priority: Priority) -> Result<KeyPublisher, NetworkError> {

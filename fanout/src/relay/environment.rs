@@ -8,7 +8,7 @@ use crate::{
     error::FanoutError,
     network::{access, commands::CommandGateway, keys::RunKeys, keys::Topic, publisher::EnvironmentPublisher},
     relay::{
-        learning::LearningCourse, reporter::StatusReporter, scans::ScanTopics, slow::SlowTopics, ticks::TickTopics,
+        learning::LearningCourse, mounted::MountedTopics, reporter::StatusReporter, slow::SlowTopics, ticks::TickTopics,
     },
     status::{self, FanoutCounters},
 };
@@ -22,7 +22,7 @@ pub struct EnvironmentRelay {
     started: Instant,
     ticks: TickTopics,
     slow: SlowTopics,
-    scans: Option<ScanTopics>,
+    mounted: MountedTopics,
     reporter: StatusReporter,
     learning: LearningCourse,
     publisher: EnvironmentPublisher,
@@ -53,7 +53,7 @@ impl EnvironmentRelay {
         Ok(Self {
             ticks: TickTopics::open(&mut membership)?,
             slow: SlowTopics::open(&mut membership)?,
-            scans: ScanTopics::open(&mut membership)?,
+            mounted: MountedTopics::open(&membership, &publisher)?,
             reporter: StatusReporter::open(&membership, env_index)?,
             learning: LearningCourse::new(first_run),
             membership,
@@ -86,9 +86,13 @@ impl EnvironmentRelay {
         let now = self.started.elapsed();
         self.ticks.publish_due(now, &mut self.publisher, &mut self.counters)?;
         self.slow.publish_due(now, &mut self.publisher, &mut self.counters)?;
-        if let Some(scans) = &mut self.scans {
-            scans.publish_due(now, self.slow.directory(), &self.publisher, &mut self.counters)?;
-        }
+        self.mounted.publish_due(
+            now,
+            &mut self.membership,
+            self.slow.directory(),
+            &self.publisher,
+            &mut self.counters,
+        )?;
         if self.reporter.is_due(now) {
             self.publish_status(State::Running, now)?;
         }
@@ -119,8 +123,7 @@ impl EnvironmentRelay {
             health.sim_time_ns = newest.sim_time_ns;
             health.drops = missed;
         });
-        let scans_refused = self.scans.as_ref().map_or(0, ScanTopics::refused);
-        let refused = self.ticks.refused() + scans_refused + self.slow.refused();
+        let refused = self.ticks.refused() + self.mounted.refused() + self.slow.refused();
         let counters = FanoutCounters {
             refused_messages: self.counters.refused_messages + refused,
             ..self.counters.clone()

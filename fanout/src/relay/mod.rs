@@ -1,13 +1,14 @@
 //! The main loop: reads shared memory, publishes what is due, reports, and ends with the run.
 //!
 //! [`environment`] is the loop's body for one environment. Its topics come in three groups: [`ticks`] belong to one tick and
-//! are published together, [`slow`] ones change seldom, and [`scans`] are published on demand.
+//! are published together, [`slow`] ones change seldom, and those of
+//! [`mounted`] sensors are published on demand.
 
 pub mod environment;
 pub mod learning;
+pub mod mounted;
 pub mod pace;
 pub mod reporter;
-pub mod scans;
 pub mod slow;
 pub mod ticks;
 

@@ -167,8 +167,9 @@ impl Run {
         RunKeys::new(&self.file.name, 0).topic(topic)
     }
 
-    pub fn scan_key(&self, id: &str) -> String {
-        RunKeys::new(&self.file.name, 0).scan(id)
+    /// Key of what `channel` carries of one mounted sensor.
+    pub fn sensor_key(&self, channel: Channel, name: &str) -> String {
+        RunKeys::new(&self.file.name, 0).sensor(channel, name)
     }
 
     /// Cleans up after a dead process, as `caraware` does.

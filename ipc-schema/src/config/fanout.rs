@@ -38,6 +38,10 @@ pub struct FanoutConfig {
     pub neighbours_hz: f64,
     /// The same of each LIDAR's `pointcloud`.
     pub pointcloud_hz: f64,
+    /// The same of each camera's `image`.
+    pub image_hz: f64,
+    /// The same of each radar's `radar`.
+    pub radar_hz: f64,
     /// The same of `event`.
     pub event_hz: f64,
     /// The same of `signals`.

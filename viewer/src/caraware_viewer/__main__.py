@@ -31,6 +31,7 @@ _EXAMPLES = """Examples:
   caraware-viewer --save run.rrd                   record; open it later with `rerun run.rrd`
   caraware-viewer --web --save run.rrd             both
   caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with all LIDAR points
+  caraware-viewer --camera cav.3@front             the images of the camera `front` of cav.3's suite, with boxes
   caraware-viewer --vehicle cav.3 --messages       what cav.3 knows from messages, and its links
   caraware-viewer tcp/127.0.0.1:7448 --run town-2  another endpoint, one of several runs there
 
@@ -117,7 +118,8 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         metavar="ID",
         action="append",
         help="a vehicle to follow (repeatable): shows its figures and its point cloud; the 3-D view follows the first "
-        "(default: a hero, else a vehicle with a LIDAR, else the first with sensors)",
+        "(default: the carriers of --camera and --radar, else a hero, else a vehicle with a LIDAR, a camera or a "
+        "radar, else the first with sensors)",
     )
     group.add_argument(
         "--rate",
@@ -143,6 +145,20 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         choices=("interest", "all", "off"),
         default="interest",
         help="LIDAR points on road users only, with the ring of the range; all points; none (default %(default)s)",
+    )
+    group.add_argument(
+        "--camera",
+        metavar="ID[@SENSOR]",
+        action="append",
+        help="a camera whose images are shown beside the 3-D view, with a box around each road user (repeatable): ID "
+        "is its carrier, SENSOR its name if it is a suite's (default: the camera of the followed vehicle; off: none)",
+    )
+    group.add_argument(
+        "--radar",
+        metavar="ID[@SENSOR]",
+        action="append",
+        help="a radar whose detections are shown in the 3-D view, coloured by radial velocity (repeatable), named in "
+        "the same way (default: the radar of the followed vehicle; off: none)",
     )
 
 

@@ -57,7 +57,7 @@ def in_world_m(
         forward = np.column_stack([-forward[:, 1], forward[:, 0], -forward[:, 2]])
     # Level them by the attitude of the sensor.
     roll, pitch, yaw = (float(angle) for angle in scan["attitude_rad"])
-    level = forward @ (_pitched(pitch) @ _rolled(roll)).T
+    level = forward @ level_from_sensor(roll, pitch).T
     # Turn and move each to where the sensor was when it fired.
     heading = yaw - yaw_rate_radps * age_s
     cos, sin = np.cos(heading), np.sin(heading)
@@ -67,6 +67,11 @@ def in_world_m(
     moved = scan["position_m"] - age_s[:, None] * np.asarray(velocity_mps, np.float64)
     world_m: NDArray[np.float64] = turned + moved
     return world_m.astype(np.float32)
+
+
+def level_from_sensor(roll_rad: float, pitch_rad: float) -> NDArray[np.float64]:
+    """The rotation `[3, 3]` that levels what a sensor saw that leaned by these angles (pitch positive nose up)."""
+    return _pitched(pitch_rad) @ _rolled(roll_rad)
 
 
 def _rolled(roll_rad: float) -> NDArray[np.float64]:

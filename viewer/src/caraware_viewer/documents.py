@@ -70,6 +70,23 @@ class MapBounds(TypedDict):
     bounds_m: list[float]
 
 
+class SensorUnit(TypedDict):
+    """A sensor that sends messages of its own."""
+
+    kind: str
+    """Name of its kind, as in `layout.SENSORS`."""
+    suite: str
+    """Name of its suite; "" for that of a section of the configuration."""
+    name: str
+
+
+class Roadside(TypedDict):
+    """A carrier that stands beside the road."""
+
+    name: str
+    suite: str
+
+
 class RunMap(TypedDict, total=False):
     """The topic `map`."""
 
@@ -82,6 +99,10 @@ class RunMap(TypedDict, total=False):
     map: MapBounds
     tick_s: float
     real_time_factor: float
+    rates_hz: dict[str, float]
+    """Most frames per wall second of each topic."""
+    sensor_units: list[SensorUnit]
+    roadsides: list[Roadside]
     scene: SceneDocument | None
 
 

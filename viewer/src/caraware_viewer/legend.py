@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from caraware_viewer import detections, top
 from caraware_viewer import messages as of_messages
-from caraware_viewer import top
 from caraware_viewer.canvas import Canvas
 
 SIGNS = "legend/signs"
@@ -35,6 +35,12 @@ _MESSAGE_ROW: tuple[tuple[str, int], ...] = (
     ("link, sender", top.rgba(of_messages.SENDER_COLOR)),
 )
 """What `--messages` adds."""
+_RADAR_ROW: tuple[tuple[str, int], ...] = (
+    (f"radar: {detections.FULL_COLOR_MPS:.0f} m/s closer", top.rgba(detections.APPROACHING)),
+    ("at rest", top.rgba(detections.STILL)),
+    (f"{detections.FULL_COLOR_MPS:.0f} m/s away", top.rgba(detections.RECEDING)),
+)
+"""What radars add: the colours of radial velocities."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +54,9 @@ class LegendSize:
 LEGEND = LegendSize(width=100.0, height=13.0)
 
 
-def draw_legend(canvas: Canvas, *, messages: bool = False) -> None:
-    """Draws the legend once; with `messages` it has a row for what is known from them."""
-    rows = (*_ROWS, _MESSAGE_ROW) if messages else _ROWS
+def draw_legend(canvas: Canvas, *, messages: bool = False, radars: bool = False) -> None:
+    """Draws the legend once; `messages` adds a row for what is known from them, `radars` one for velocities."""
+    rows = (*_ROWS, *([_MESSAGE_ROW] if messages else []), *([_RADAR_ROW] if radars else []))
     places, names, colors = [], [], []
     for row, signs in enumerate(rows):
         for column, (name, color) in enumerate(signs):

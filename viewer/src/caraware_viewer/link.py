@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
@@ -27,8 +27,6 @@ MESSAGES = "neighbours"
 """The topic of what is known from messages, which the fan-out sends while a viewer subscribes."""
 WHOLE_COURSE = "learning/whole"
 """Name under which the answer to a query for `learning` is stored."""
-CLOUD_PREFIX = "pointcloud/"
-"""Beginning of the topics of point clouds; a vehicle's id follows."""
 
 RESTART_LIMIT_S = 5.0
 """Time without a liveliness token after which the run counts as ended; a dead fan-out is restarted sooner."""
@@ -223,7 +221,7 @@ class RunLink:
         self._end_timer: threading.Timer | None = None
         # A subscriber ends when it is garbage-collected, so they are kept here.
         self._subscribers = [self._subscribe(topic) for topic in self._topics]
-        self._clouds: dict[str, zenoh.Subscriber[None]] = {}
+        self._sensors: dict[str, zenoh.Subscriber[None]] = {}
         # zenoh reports the end of a killed peer's token only to clients that have seen the token: hence the history.
         self._tokens = session.liveliness().declare_subscriber(f"{run.prefix}/alive", self._on_token, history=True)
         self._query_newest()
@@ -244,13 +242,12 @@ class RunLink:
             f"run {self.run.run!r} did not send its map within {timeout_s:g} s: its fan-out may have just ended"
         )
 
-    def subscribe_clouds(self, vehicles: Iterable[str]) -> None:
-        """Subscribes to the point clouds of the vehicles with these ids, and to no others."""
-        wanted = {CLOUD_PREFIX + encoded(vehicle) for vehicle in vehicles}
-        for topic in self._clouds.keys() - wanted:
-            self._clouds.pop(topic).undeclare()
-        for topic in wanted - self._clouds.keys():
-            self._clouds[topic] = self._subscribe(topic)
+    def subscribe_sensors(self, topics: Collection[str]) -> None:
+        """Subscribes to these topics of mounted sensors, and to no others of them."""
+        for topic in self._sensors.keys() - set(topics):
+            self._sensors.pop(topic).undeclare()
+        for topic in set(topics) - self._sensors.keys():
+            self._sensors[topic] = self._subscribe(topic)
 
     def _subscribe(self, topic: str) -> zenoh.Subscriber[None]:
         def store(sample: zenoh.Sample) -> None:

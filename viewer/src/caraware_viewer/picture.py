@@ -18,7 +18,8 @@ class Picture:
     """The newest state of a run; any part may be missing."""
 
     wanted: Sequence[str] = ()
-    """SUMO ids of the vehicles to follow; empty: a hero, else a vehicle with a LIDAR, else the first with sensors.
+    """SUMO ids of the vehicles to follow; empty: a hero, else a vehicle with a LIDAR, a camera or a radar (in this
+    order), else the first with sensors.
     Where messages are shown, it is one with a radio."""
     world: wire.World | None = None
     observation: wire.Observation | None = None
@@ -98,14 +99,18 @@ class Picture:
         return [] if self._last_default is None else [self._last_default]
 
     def _default_vehicle(self, states: NDArray[np.void]) -> int | None:
-        """A hero, else a vehicle with a LIDAR, else the first with sensors. Without observations, the first CAV."""
+        """A hero, else a vehicle with a LIDAR, a camera or a radar, else the first with sensors.
+
+        Without observations, the first CAV.
+        """
         heroes = states["id_hash"][states["kind"] == wire.HERO]
         if len(heroes):
             return int(heroes[0])
         present = set(self._with_radio(states)["id_hash"].tolist())
         if self.observation is not None:
             valid = self.observation.valid
-            for chosen in (valid & (self.observation.sensors & wire.sensor_bit("lidar") != 0), valid):
+            bits = [wire.sensor_bit(kind) for kind in ("lidar", "camera", "radar")]
+            for chosen in (*(valid & (self.observation.sensors & bit != 0) for bit in bits), valid):
                 sensing = [int(h) for h in self.observation.id_hash[chosen] if int(h) in present]
                 if sensing:
                     return sensing[0]

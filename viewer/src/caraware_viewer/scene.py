@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,9 +20,11 @@ from caraware_viewer.display import SERVER_MEMORY_MIB
 from caraware_viewer.documents import RoadUserCounts, RunMap, RunStatus
 from caraware_viewer.hud import ViewerFigures, hanging, hud
 from caraware_viewer.legend import draw_legend
-from caraware_viewer.link import CLOUD_PREFIX, WHOLE_COURSE, Sample
+from caraware_viewer.link import WHOLE_COURSE, Sample
+from caraware_viewer.mounted import CAMERA, LIDAR, RADAR, names_on
 from caraware_viewer.pairing import Pairing, distances, mean_m
 from caraware_viewer.picture import Picture
+from caraware_viewer.sights import Sights
 from caraware_viewer.static_map import draw_map
 from caraware_viewer.wire import FrameError
 
@@ -94,10 +96,13 @@ class Scene:
         live: rr.RecordingStream | None = None,
         region: Region | None = None,
         messages: bool = False,
+        cameras: Sequence[str] | None = None,
+        radars: Sequence[str] | None = None,
     ) -> None:
         """`recording` keeps the history of the run, and `live` shows its present; either may be missing.
 
-        With `messages` the legend names what is drawn of frames of `neighbours`.
+        With `messages` the legend names what is drawn of frames of `neighbours`. `cameras` and `radars` name those that
+        are shown, as `ID` or `ID@SENSOR`; without them they are those of the followed vehicle.
         """
         try:
             self._canvas = Canvas(recording, float(run_map["tick_s"]), live)
@@ -115,6 +120,7 @@ class Scene:
         self._region, self._extent_m = region, max(x_max - x_min, y_max - y_min)
         self._detail: Detail | None = None
         self._routes_drawn = False
+        self._notes: list[str] = []
         self.display_pid: int | None = None
         """rerun's process, whose memory the HUD shows."""
         self._memory_mb = (float("nan"), float("nan"))
@@ -131,16 +137,30 @@ class Scene:
         """Frames that were not drawn because newer ones had arrived, as the link counts them."""
         self._stop_lines = _stop_lines(run_map)
         self._paint = draw_map(self._canvas, run_map)
-        draw_legend(self._canvas, messages=messages)
+        self._sights = Sights(self._canvas, run_map, cameras, radars)
+        draw_legend(self._canvas, messages=messages, radars=self._sights.has_radars)
         plots.name_series(self._canvas)
         self.server_mib = SERVER_MEMORY_MIB + _MAPS_KEPT * self._canvas.live_bytes / 2**20
         """What rerun's server has to keep, so that a new browser finds the map in it."""
 
-    def cloud_vehicles(self) -> list[str]:
-        """SUMO ids of the vehicles whose point clouds are shown."""
-        if self._lidar == "off":
-            return []
-        return [self._picture.names[h] for h in self._picture.followed() if h in self._picture.names]
+    def sensor_topics(self) -> set[str]:
+        """Topics of the mounted sensors that are shown: point clouds of the followed vehicles, images, detections."""
+        followed = self._picture.followed()
+        names = [self._picture.names[id_hash] for id_hash in followed if id_hash in self._picture.names]
+        main = self._picture.names.get(followed[0]) if followed else None
+        clouds = [] if self._lidar == "off" else names
+        scanned = {LIDAR.topic_of(name) for carrier in clouds for name in names_on(LIDAR, carrier, self._map)}
+        return scanned | self._sights.topics(main)
+
+    @property
+    def camera_titles(self) -> dict[str, str]:
+        """Title of each camera's view by its path, of those that have an image."""
+        return {path: title for path, title in self._sights.titles.items() if path in self._canvas.figures}
+
+    def take_notes(self) -> list[str]:
+        """What the user should know about the chosen sensors, since the last call."""
+        notes, self._notes = self._notes, []
+        return notes
 
     def draw(self, topic: str, sample: Sample) -> None:
         """Draws a sample. Raises `wire.FrameError` if the sample must be refused."""
@@ -169,8 +189,16 @@ class Scene:
                 self._picture.enter_routes(wire.decode_table(sample.payload, wire.ROUTE_POINT))
             case "event":
                 self._draw_event(wire.decode_table(sample.payload, wire.COLLISION))
-            case _ if topic.startswith(CLOUD_PREFIX):
+            case _ if LIDAR.has(topic):
                 self._draw_cloud(wire.decode_cloud(sample.payload))
+            case _ if CAMERA.has(topic):
+                seen = wire.decode_image(sample.payload)
+                self._set_tick(seen.header)
+                self._sights.draw_image(topic, seen, self._main)
+            case _ if RADAR.has(topic):
+                detected = wire.decode_detections(sample.payload)
+                self._set_tick(detected.header)
+                self._sights.draw_detections(topic, detected, self._main)
 
     @property
     def figures(self) -> frozenset[str]:
@@ -191,6 +219,11 @@ class Scene:
         """True in a run with heroes."""
         return self._picture.driving
 
+    @property
+    def _main(self) -> int | None:
+        """Hash of the id of the main followed vehicle; `None` without one."""
+        return next(iter(self._picture.followed()), None)
+
     def _check_run(self, header: wire.Header) -> None:
         expected = self._map.get("run_id")
         if expected is not None and header.run_id != int(expected, 16):
@@ -198,7 +231,8 @@ class Scene:
 
     def _draw_world(self, world: wire.World, sample: Sample) -> None:
         before, self._picture.world = self._picture.world, world
-        if before is not None and before.header.episode != world.header.episode:
+        is_new_episode = before is not None and before.header.episode != world.header.episode
+        if is_new_episode:
             self._contacts.clear()
             self._clouds.clear()
             # Its vehicles are counted anew.
@@ -207,6 +241,7 @@ class Scene:
         self._drawn_at.append(self._clock())
         self._age_ms = sample.age_ms()
         followed = self._picture.followed()
+        self._sights.forget_departed(world, self._main, is_new_episode=is_new_episode)
         rows = [row for row in map(self._picture.row, followed) if row is not None]
         self._detail = detail.choose(world.states, rows[0] if rows else None, self._extent_m, self._region)
         self._picture.thinned = _left_out(self._detail)
@@ -248,6 +283,7 @@ class Scene:
 
     def _draw_observation(self, observation: wire.Observation) -> None:
         self._picture.observation = observation
+        self._notes += self._sights.reasons(self._picture)
         self._set_tick(observation.header)
         top.draw_observation(self._canvas, observation, self._shown(observation))
         pair = self._pairing.observation(observation)

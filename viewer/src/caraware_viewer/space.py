@@ -15,6 +15,7 @@ from caraware_viewer.top import CONTACT_COLOR, KIND_COLORS, light_colors, route_
 WORLD = "space/world"
 VEHICLES = "space/world/vehicles"
 CLOUD = "space/world/lidar"
+RADAR = "space/world/radar"
 SIGNALS = "space/world/signals"
 ROUTES = "space/world/routes"
 CONTACTS = "space/world/contacts"
@@ -56,6 +57,11 @@ def vehicle_from_world(origin_m: NDArray[np.float64], yaw_rad: float) -> rr.Tran
 def draw_cloud(canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32]) -> None:
     """Draws the points of the vehicle's LIDAR."""
     canvas.log(CLOUD, rr.Points3D(points_m, colors=colors, radii=rr.Radius.ui_points(1.2)))
+
+
+def draw_detections(canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32]) -> None:
+    """Draws the detections of radars."""
+    canvas.log(RADAR, rr.Points3D(points_m, colors=colors, radii=rr.Radius.ui_points(3.5)))
 
 
 def draw_signals(canvas: Canvas, lights: Sequence[tuple[Sequence[float], str]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import rerun as rr
@@ -18,6 +18,9 @@ _MARGIN = 0.02
 BACKGROUND = [20, 23, 29]
 MAX_PLOTS = 5
 """Most plots beside one another; the first rows of `PLOTS` come first."""
+_STACKED_CAMERAS = 3
+"""Most images below one another; of more, two are beside one another."""
+_CAMERA_SHARE = 2.6
 
 
 @dataclass(frozen=True)
@@ -61,17 +64,22 @@ def shown_plots(mode: str, figures: Collection[str]) -> tuple[Plot, ...]:
     return tuple(plot for plot in of_mode if any(_is_under(path, plot.path) for path in figures))[:MAX_PLOTS]
 
 
-def layout_of(mode: str, figures: Collection[str]) -> tuple[object, ...]:
+def layout_of(mode: str, figures: Collection[str], cameras: Mapping[str, str] | None = None) -> tuple[object, ...]:
     """What a layout depends on: two equal ones need no second blueprint."""
-    return (mode, shown_plots(mode, figures), space.VEHICLES in figures)
+    return (mode, shown_plots(mode, figures), space.VEHICLES in figures, tuple((cameras or {}).items()))
 
 
 def blueprint(
-    bounds_m: Sequence[float], mode: str = "train", figures: Collection[str] = (), region: Region | None = None
+    bounds_m: Sequence[float],
+    mode: str = "train",
+    figures: Collection[str] = (),
+    region: Region | None = None,
+    cameras: Mapping[str, str] | None = None,
 ) -> rrb.Blueprint:
-    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max) or of a region, legend, HUD, 3-D view, and plots.
+    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max) or of a region, legend, HUD, 3-D view, images and
+    plots.
 
-    `figures` are the paths that have data; a view without any is left out.
+    `figures` are the paths that have data; a view without any is left out. `cameras` are the titles of images by path.
     """
     plotted = [_plot(plot) for plot in shown_plots(mode, figures)]
     columns: list[rrb.Container | rrb.View] = [
@@ -83,6 +91,11 @@ def blueprint(
         middle.append(_space())
     columns.append(rrb.Vertical(*middle, row_shares=[5, 6][: len(middle)]))
     shares.append(3.4)
+    if cameras:
+        views = [_camera(path, title) for path, title in cameras.items()]
+        stacked = len(views) <= _STACKED_CAMERAS
+        columns.append(rrb.Vertical(*views) if stacked else rrb.Grid(*views, grid_columns=2))
+        shares.append(_CAMERA_SHARE if stacked else 2 * _CAMERA_SHARE)
     if plotted:
         columns.append(rrb.Vertical(*plotted))
         shares.append(2.6)
@@ -134,6 +147,10 @@ def _space() -> rrb.Spatial3DView:
         line_grid=False,
         eye_controls=eye,
     )
+
+
+def _camera(path: str, title: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(name=title, origin=f"/{path}", background=BACKGROUND)
 
 
 def _plot(plot: Plot) -> rrb.TimeSeriesView:

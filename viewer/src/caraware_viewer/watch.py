@@ -17,6 +17,7 @@ from caraware_viewer.detail import Region
 from caraware_viewer.display import Display, has_screen
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import RunLink, connect, find_run
+from caraware_viewer.mounted import CAMERA, OFF, RADAR, carriers, check_choices
 from caraware_viewer.page import Pace
 from caraware_viewer.scene import Scene
 from caraware_viewer.views import blueprint, layout_of, mode_of
@@ -40,15 +41,20 @@ def watch_run(options: argparse.Namespace) -> int:
         raise
     with RunLink(session, run, messages=options.messages) as link:
         run_map = link.map(options.timeout)
+        for kind, names in ((CAMERA, options.camera), (RADAR, options.radar)):
+            check_choices(kind, [name for name in names or () if name != OFF], run_map)
+        chosen = [name for name in (*(options.camera or ()), *(options.radar or ())) if name != OFF]
         kept, live = _recordings(options, f"{run.run}/{run.env}")
         scene = Scene(
             kept,
             run_map,
-            options.vehicle,
+            options.vehicle or carriers(chosen, run_map),
             options.lidar,
             live=live,
             region=options.region,
             messages=options.messages,
+            cameras=options.camera,
+            radars=options.radar,
         )
         with _open_display(options, scene.server_mib) as display:
             _connect(live, options, display)
@@ -115,11 +121,12 @@ class Layout:
     def arrange(self, scene: Scene) -> None:
         """Sends a new arrangement if another view has data, or one has lost its place."""
         mode = mode_of(str(self._map.get("mode", "train")), driving=scene.driving)
-        shown = layout_of(mode, scene.figures)
+        cameras = scene.camera_titles
+        shown = layout_of(mode, scene.figures, cameras)
         if shown == self._shown:
             return
         self._shown = shown
-        views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region)
+        views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region, cameras)
         for recording in self.recordings:
             recording.send_blueprint(views, make_active=True, make_default=True)
 
@@ -162,7 +169,9 @@ def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate: FrameRate) -
         layout.arrange(scene)
         if closed:
             return
-        link.subscribe_clouds(scene.cloud_vehicles())
+        for note in scene.take_notes():
+            print(f"caraware-viewer: {note}", file=sys.stderr)
+        link.subscribe_sensors(scene.sensor_topics())
         # Meanwhile newer frames replace those that wait.
         link.frames.wait_for_close(rate.interval_s() - (time.monotonic() - begun_s))
 

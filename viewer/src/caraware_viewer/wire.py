@@ -49,6 +49,22 @@ SCAN = RECORDS["Scan"]
 """Pose of a LIDAR at the end of the tick; `axes` 0: x forward, y left, z up; 1: y back, x left, z down."""
 LIDAR_POINT = RECORDS["LidarPoint"]
 """One return, in the axes that the sensor had when it fired."""
+IMAGE_HEAD = RECORDS["ImageHead"]
+"""Pose of a camera at the end of the tick, and the size of its image."""
+SEEN_OBJECT = RECORDS["SeenObject"]
+"""A road user of which an image shows a pixel: its class, boxes (pixels) and depths (metres)."""
+PLANES: tuple[tuple[str, str, tuple[int, ...]], ...] = (
+    ("depth_m", "<f4", ()),
+    ("instance", "<u4", ()),
+    ("semantic", "|u1", ()),
+    ("rgb", "|u1", (3,)),
+    ("binary", "|u1", ()),
+)
+"""Name, scalar and shape of a pixel of each plane of an image, in their order; the place is the bit in `planes`."""
+RADAR_SCAN = RECORDS["RadarScan"]
+"""Pose of a radar at the end of the tick; x forward, y left, z up."""
+RADAR_DETECTION = RECORDS["RadarDetection"]
+"""One detection: range (metres), azimuth and elevation (radians), radial velocity (m/s, positive towards it)."""
 
 
 class FrameError(ValueError):
@@ -189,6 +205,30 @@ class PointCloud:
     """`LIDAR_POINT [count]`."""
 
 
+@dataclass(frozen=True)
+class CameraImage:
+    """One image of a camera (`h` rows, `w` columns)."""
+
+    header: Header
+    head: np.void
+    """`IMAGE_HEAD`."""
+    planes: dict[str, NDArray[Any]]
+    """The planes that the frame has, `[h, w]` and `[h, w, 3]`, by their names in `PLANES`."""
+    objects: NDArray[np.void]
+    """`SEEN_OBJECT [count]`."""
+
+
+@dataclass(frozen=True)
+class RadarDetections:
+    """The detections of one radar in a scan."""
+
+    header: Header
+    scan: np.void
+    """`RADAR_SCAN`."""
+    detections: NDArray[np.void]
+    """`RADAR_DETECTION [count]`."""
+
+
 def decode_header(frame: bytes) -> Header:
     """The header of a frame; refuses a frame that is too short or has another schema version."""
     if len(frame) < HEADER.itemsize:
@@ -246,6 +286,38 @@ def decode_cloud(frame: bytes) -> PointCloud:
     if len(sections["scan"]) != 1:
         raise FrameError(f"a point cloud has one scan, but this one has {len(sections['scan'])}")
     return PointCloud(header, sections["scan"][0], sections["points"])
+
+
+def decode_image(frame: bytes) -> CameraImage:
+    """An `image/<id>` frame. Planes that a later version adds come behind the others, and are skipped."""
+    header = decode_header(frame)
+    sections = _sections(frame, "image", header)
+    if len(sections["head"]) != 1:
+        raise FrameError(f"an image has one head, but this one has {len(sections['head'])}")
+    head = sections["head"][0]
+    size = (int(head["height"]), int(head["width"]))
+    content = sections["planes"].tobytes()
+    planes: dict[str, NDArray[Any]] = {}
+    offset = 0
+    for bit, (name, scalar, shape) in enumerate(PLANES):
+        if int(head["planes"]) >> bit & 1 == 0:
+            continue
+        count = math.prod((*size, *shape))
+        length = count * np.dtype(scalar).itemsize
+        if offset + length > len(content):
+            raise FrameError(f"the planes of an image of {size[1]} x {size[0]} pixels have {len(content)} bytes")
+        planes[name] = np.frombuffer(content, scalar, count, offset).reshape((*size, *shape))
+        offset += length
+    return CameraImage(header, head, planes, sections["objects"])
+
+
+def decode_detections(frame: bytes) -> RadarDetections:
+    """A `radar/<id>` frame."""
+    header = decode_header(frame)
+    sections = _sections(frame, "radar", header)
+    if len(sections["scan"]) != 1:
+        raise FrameError(f"a radar's frame has one scan, but this one has {len(sections['scan'])}")
+    return RadarDetections(header, sections["scan"][0], sections["detections"])
 
 
 def decode_text(field: np.void, length: int) -> str:
