@@ -111,11 +111,12 @@ fn an_image_goes_to_those_who_subscribe_while_they_do() {
     });
     assert_eq!(send_both(), [1, 1]);
     for _ in 0..3 {
+        // Long enough for the next image to be due.
+        std::thread::park_timeout(Duration::from_millis(150));
+        send_both();
         let (header, payload) = next(&seen);
         let (layout, expected) = image(header.tick, 1, 84, 60);
         assert_eq!((header.shape, payload), (layout.shape, expected));
-        send_both();
-        std::thread::park_timeout(Duration::from_millis(120));
     }
     assert!(ask(&viewer, &run.sensor_key(Channel::Image, IDS[0])).is_none());
     assert!(ask(&viewer, &run.sensor_key(Channel::Radar, IDS[1])).is_none());
@@ -123,6 +124,20 @@ fn an_image_goes_to_those_who_subscribe_while_they_do() {
     seen.undeclare().wait().unwrap();
     until("the end of the subscription", || send_both() == [0, 0]);
     until("the end of the answers", || ask(&viewer, &key).is_none());
+}
+
+/// A fan-out adds to the reserve of a run what it has in hand, and no queue of images of its own.
+#[test]
+fn a_fan_out_needs_few_images_more() {
+    let run = Run::with_settings("reserve", Mode::Simulate, 50.0, sensing(84, 60));
+    let mut alone = run.file.clone();
+    alone.config.fanout.enabled = false;
+    for channel in [Channel::Image, Channel::Radar, Channel::Pointcloud] {
+        let spec = channel.spec();
+        let [with, without] = [&run.file, &alone].map(|file| channel.worst_case_messages(file));
+        assert_eq!(with, without + (spec.in_hand)(&run.file), "{}", spec.name);
+        assert!(without > channel.queue_length(&alone), "{}", spec.name);
+    }
 }
 
 /// An image that is too long for a frame goes out reduced, and is counted.
