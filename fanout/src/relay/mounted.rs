@@ -30,6 +30,9 @@ use crate::{
 /// A sensor without a message for this long has left, or its key has no subscriber.
 const SENSOR_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// A pass publishes no further message after this many bytes, so that what it adds to a viewer's queue is rarely more than one long frame.
+const PASS_BYTES: usize = MAX_SENSOR_BYTES / 2;
+
 /// The sensor that a message is of.
 #[derive(Debug, Clone, Copy)]
 struct MessageOrigin {
@@ -53,7 +56,7 @@ struct MountedKind {
     count: fn(&mut FanoutCounters, usize),
 }
 
-/// The kinds of sensors whose messages are published, those with short frames first: a pass publishes no more than a viewer's queue holds.
+/// The kinds of sensors whose messages are published, those with short frames first, because of which a pass may go on.
 const MOUNTED: [MountedKind; 3] = [
     MountedKind {
         kind: SensorKind::Radar,
@@ -168,7 +171,7 @@ impl MountedTopics {
         self.topics.iter().map(MountedTopic::refused).sum()
     }
 
-    /// Publishes the queued messages that are due, at most as many as a viewer's queue holds; the next call publishes the others.
+    /// Publishes queued messages that are due, until they have [`PASS_BYTES`]; the next call publishes the others.
     ///
     /// # Errors
     /// A port or zenoh broke.
@@ -183,7 +186,7 @@ impl MountedTopics {
         let mut burst_bytes = 0;
         for topic in &mut self.topics {
             topic.follow_demand(now, membership)?;
-            while burst_bytes < MAX_SENSOR_BYTES
+            while burst_bytes < PASS_BYTES
                 && let Some(message) = topic.receive()?
             {
                 let name = |origin: &MessageOrigin| carrier_id(directory, &self.roadsides, origin);
