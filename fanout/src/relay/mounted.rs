@@ -56,7 +56,7 @@ struct MountedKind {
     count: fn(&mut FanoutCounters, usize),
 }
 
-/// The kinds of sensors whose messages are published, those with short frames first, because of which a pass may go on.
+/// The kinds of sensors whose messages are published. Those with short frames come first: a pass continues after them.
 const MOUNTED: [MountedKind; 3] = [
     MountedKind {
         kind: SensorKind::Radar,
