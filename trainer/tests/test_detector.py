@@ -100,7 +100,7 @@ def test_a_broken_detector_has_a_low_precision() -> None:
     assert class_precisions(aside, scenes)["mean"] == 0.0
     assert class_precisions(aside, scenes, at_least=0.3)["mean"] == 1.0
     assert class_precisions([changed(one, classes=one.classes[::-1].copy()) for one in found], scenes)["mean"] == 0.0
-    # Another detector says everything twice: at each recall half of what it said is false.
+    # Another says everything twice: the k-th hit comes as number 2 k - 1.
     twice = [
         Detections(
             np.repeat(one.boxes_px, 2, axis=0),
@@ -110,7 +110,7 @@ def test_a_broken_detector_has_a_low_precision() -> None:
         )
         for one in found
     ]
-    assert 0.45 < class_precisions(twice, scenes)["mean"] < 0.55
+    assert class_precisions(twice, scenes)["mean"] == pytest.approx(sum(k / (2 * k - 1) for k in range(1, 21)) / 20)
     # One that knows half of the images.
     blind = changed(found[0], **{name: value[:0] for name, value in vars(found[0]).items()})
     assert class_precisions([*found[:10], *[blind] * 10], scenes)["mean"] == pytest.approx(0.5)
@@ -258,7 +258,7 @@ def test_the_file_computes_what_torch_does(file: Path, tmp_path: Path, monkeypat
     assert [len(output) for output in OnnxDetector(file).cells(images[:1].numpy())] == [1, 1, 1]
     other = untrained()
     with torch.no_grad():
-        next(other.parameters()).mul_(1.01)
+        next(other.parameters()).mul_(1.2)
     assert difference_from_torch(other, file, images) > 1e-3
     monkeypatch.setattr(exported, "difference_from_torch", lambda *_: 2e-3)
     with pytest.raises(ExportError, match="differs from torch by 2"):
@@ -414,7 +414,7 @@ def test_a_short_training_helps_and_the_detector_fills_fields_of_a_run(
     def report(step: int, loss: Losses, elapsed_s: float) -> None:
         history.append(float(sum(loss)))
 
-    network = train(images, Settings(steps=60, batch_size=16), report)
+    network = train(images, Settings(steps=100, batch_size=20), report)
     assert history[-1] < 0.7 * history[0], history
     trained = tmp_path / "trained.onnx"
     export(network, trained, HEIGHT, WIDTH)
@@ -424,9 +424,9 @@ def test_a_short_training_helps_and_the_detector_fills_fields_of_a_run(
     }
     assert precision["before"] < 0.02 and precision["after"] > 0.05, precision
     shared_before = set(Path("/dev/shm").iterdir())
-    figures = run(OnnxDetector(trained, 0.1), "town", 3, 12.0)
+    figures = run(OnnxDetector(trained, 0.1), "town", 3, 16.0)
     assert figures["images"] > figures["ticks"] >= 100
     assert 0.0 < figures["recall"] <= 1.0 and 0.0 < figures["precision"] <= 1.0
-    assert figures["objects"] > 50 and figures["error_median_m"] < 15.0
+    assert figures["objects"] > 20 and figures["error_median_m"] < 15.0
     assert set(Path("/dev/shm").iterdir()) <= shared_before
     assert set(FIELDS) > {"object_1_x", "object_4_y"}

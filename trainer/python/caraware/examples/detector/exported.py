@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from caraware.examples.detector.metric import Detections, iou
-from caraware.examples.detector.network import Network, peaks
+from caraware.examples.detector.network import STRIDE, Network
 
 OPSET = 18
 """Version of ONNX's operators in the file."""
@@ -22,7 +22,7 @@ TOLERANCE = 1e-3
 
 
 class Exported(nn.Module):
-    """The network with its peaks: what the file holds."""
+    """The network with scores in place of logits: what the file holds."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class Exported(nn.Module):
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """u8 [B, 3, height, width] to scores [B, 4, h, w], boxes [B, 4, h, w], places [B, 2, h, w], as in `Cells`."""
         cells = self.network(images)
-        return peaks(cells), cells.boxes_px, cells.places
+        return cells.heat.sigmoid(), cells.boxes_px, cells.places
 
 
 class ExportError(RuntimeError):
@@ -100,20 +100,28 @@ class OnnxDetector:
 def decode(
     scores: np.ndarray, boxes_px: np.ndarray, places: np.ndarray, least_score: float, most: int = 100
 ) -> list[Detections]:
-    """Detections of B images from peaks, boxes and places of their cells, at most `most` of each.
+    """Detections of B images from scores, boxes and places of their cells, at most `most` of each.
 
-    Of two of a class that overlap by more than half the more certain one stays.
+    A cell is an object of a class where no neighbour's score exceeds its own. Of two boxes of a class that overlap by
+    more than half the more certain one stays.
     """
     found = []
     for score, boxes, place in zip(scores, boxes_px, places, strict=True):
-        kind, row, column = np.nonzero(score >= least_score)
+        kind, row, column = np.nonzero((score >= least_score) & (score == _largest_around(score)))
         order = np.argsort(-score[kind, row, column], kind="stable")[:most]
         kind, row, column = kind[order], row[order], column[order]
-        height, width = 4 * score.shape[1], 4 * score.shape[2]
+        height, width = STRIDE * score.shape[1], STRIDE * score.shape[2]
         box = boxes[:, row, column].T.clip(0, [width, height, width, height])
         one = Detections(box, kind.astype(np.int64), score[kind, row, column], place[:, row, column].T)
         found.append(_kept(one, without_rivals(box, np.where(kind[:, None] == kind, 1.0, 0.0))))
     return found
+
+
+def _largest_around(score: np.ndarray) -> np.ndarray:
+    """The largest score of each cell and its eight neighbours, [4, h, w]."""
+    padded = np.pad(score, ((0, 0), (1, 1), (1, 1)))
+    largest: np.ndarray = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2)).max((3, 4))
+    return largest
 
 
 def without_rivals(boxes: np.ndarray, rivals: np.ndarray | None = None, most: float = 0.5) -> np.ndarray:

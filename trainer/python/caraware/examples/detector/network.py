@@ -105,12 +105,6 @@ def _cells(heat: Tensor, raw: Tensor) -> Cells:
     return Cells(heat, boxes, torch.cat([column, depth], dim=1))
 
 
-def peaks(cells: Cells) -> Tensor:
-    """f32 [B, 4, h, w]: scores 0 ... 1 of the cells that no neighbour exceeds, 0 elsewhere."""
-    score = cells.heat.sigmoid()
-    return score * (F.max_pool2d(score, 3, stride=1, padding=1) == score)
-
-
 class Labels(NamedTuple):
     """The objects of B images, at most K of each."""
 

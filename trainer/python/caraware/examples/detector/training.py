@@ -21,7 +21,7 @@ MOST_OBJECTS = 48
 class Settings:
     """Hyper-parameters."""
 
-    steps: int = 1800
+    steps: int = 1000
     batch_size: int = 24
     learning_rate: float = 4e-3
     weight_decay: float = 1e-4
