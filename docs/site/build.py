@@ -49,6 +49,7 @@ NAVIGATION = {
         "docs/camera",
         "docs/suites",
         "docs/seeing",
+        "docs/detector",
         "docs/v2x",
     ],
     "Learning": [

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from caraware.envs import make
 from caraware.examples.detector import exported
 from caraware.examples.detector.exported import ExportError, OnnxDetector, decode, difference_from_torch, export
 from caraware.examples.detector.images import CAMERA, Class, LabelledImages, Objects, collect, focal_px, objects_of
-from caraware.examples.detector.loop import FIELDS, Accuracy, run
+from caraware.examples.detector.loop import FIELDS, WITHIN_M, Accuracy, run
 from caraware.examples.detector.metric import (
     MISS,
     NOT_COUNTED,
@@ -22,10 +23,12 @@ from caraware.examples.detector.metric import (
 )
 from caraware.examples.detector.network import STRIDE, Cells, Labels, Losses, Network, encode, generalised_iou, losses
 from caraware.examples.detector.objects import DetectedObjects, Mounting
+from caraware.examples.detector.traffic import write_mixed_traffic
 from caraware.examples.detector.training import Settings, augmented, stacked, train
 from caraware.ipc.image import IMAGE, SEEN, Image, Label
 from caraware.ipc.mounts import MountedSensor
 from caraware.ipc.run_file import ConfigError
+from caraware.tasks.fields import Fields
 
 HEIGHT, WIDTH = 96, 192
 RANGE_M = 80.0
@@ -403,6 +406,41 @@ def test_collected_images_show_every_class(real: tuple[LabelledImages, LabelledI
         inside = (one.places[:, 0] > one.boxes_px[:, 0]) & (one.places[:, 0] < one.boxes_px[:, 2])
         assert inside.all() and (one.places[:, 1] > 0).all()
     assert not np.array_equal(seen.rgb[: len(unseen)], unseen.rgb)
+
+
+def test_labelled_places_are_where_the_lidar_measures_objects(tmp_path: Path) -> None:
+    # Askew, so that a wrong sign or order of the rotations shows. The LIDAR is another sensor with its own mounting.
+    settings = CAMERA | {
+        "camera.vehicles": 16,
+        "camera.mount": [1.0, 0.4, 1.6, 0.1, -0.25, 0.5],
+        "lidar.vehicles": 16,
+        "observation.fields": FIELDS,
+        "run.window_ticks": 2,
+        "episode.ticks": 200,
+    }
+    apart_m, waiting = [], list[Image]()
+    with make(write_mixed_traffic("town", tmp_path, 5, 20.0), settings, 5) as simulation:
+        channel, fields = simulation.channel, Fields.from_run(simulation.run)
+        mounting = Mounting(simulation.run["config"]["camera"])
+        channel.images()
+        while (obs := simulation.receive()) is not None and obs.episode == 0:
+            waiting = [image for image in [*waiting, *channel.images()] if image.tick >= obs.tick]
+            slot_of = {int(vehicle): slot for slot, vehicle in enumerate(obs.vehicle)}
+            for image in waiting:
+                if image.tick != obs.tick or image.vehicle not in slot_of or len(image.objects) == 0:
+                    continue
+                row = obs.observation.numpy()[slot_of[image.vehicle]]
+                lidar = np.array([[fields.si(row, f"object_{k}_{axis}") for axis in "xy"] for k in range(1, 5)])
+                truth = objects_of(image)
+                seen_at = mounting.body_m(truth.places, truth.boxes_px[:, [1, 3]].mean(1))[:, :2]
+                nearest = seen_at[np.hypot(*seen_at.T).argmin()]
+                if np.hypot(*nearest) < WITHIN_M:
+                    apart_m.append(np.hypot(*(lidar - nearest).T).min())
+            channel.consumed(obs.tick)
+    # The row of the nearest point is not in a label, a beam may miss the point that the camera sees, and points move
+    # while the LIDAR turns.
+    assert len(apart_m) > 200
+    assert np.median(apart_m) < 1.0 and np.quantile(apart_m, 0.9) < 2.5
 
 
 def test_a_short_training_helps_and_the_detector_fills_fields_of_a_run(

@@ -40,7 +40,7 @@ class Cells(NamedTuple):
 
 
 class Network(nn.Module):
-    """Some 0.6 million parameters."""
+    """1.0 million parameters."""
 
     def __init__(self) -> None:
         super().__init__()
