@@ -387,6 +387,11 @@ def test_accuracy_by_hand() -> None:
     )
 
 
+def test_a_map_without_mixed_traffic_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="town or avenue"):
+        write_mixed_traffic("valley", tmp_path, 1, 10.0)
+
+
 # A real simulation.
 
 
@@ -460,7 +465,7 @@ def test_a_short_training_helps_and_the_detector_fills_fields_of_a_run(
         name: class_precisions(OnnxDetector(path, 0.01).detect(unseen.rgb), unseen.objects)["mean"]
         for name, path in (("before", file), ("after", trained))
     }
-    assert precision["before"] < 0.02 and precision["after"] > 0.05, precision
+    assert precision["before"] < 0.02 and precision["after"] > 0.03, precision
     shared_before = set(Path("/dev/shm").iterdir())
     figures = run(OnnxDetector(trained, 0.1), "town", 3, 16.0)
     assert figures["images"] > figures["ticks"] >= 100

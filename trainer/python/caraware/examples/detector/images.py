@@ -147,7 +147,8 @@ def collect(scenario: str, seed: int, duration_s: float, every_s: float = 2.0, *
     """Images of `duration_s` of a simulation, one for each camera and `every_s`, with their labels.
 
     `scenario` is a map of `MAPS`, on which mixed traffic drives, or a `.sumocfg`, which drives as it is. The seed draws
-    traffic and light. Raises `SimulationError` where the simulation cannot run.
+    traffic and light. Images without a road user are left out. Raises `SimulationError` where the simulation cannot
+    run, and ValueError where no image is left.
     """
     rgb, objects = [], []
     with tempfile.TemporaryDirectory(prefix="caraware-detector-") as folder:
@@ -158,6 +159,8 @@ def collect(scenario: str, seed: int, duration_s: float, every_s: float = 2.0, *
             if len(image.objects):
                 rgb.append(image.rgb.transpose(2, 0, 1).copy())
                 objects.append(objects_of(image))
+    if not rgb:
+        raise ValueError(f"no image of {scenario} shows a road user in {duration_s} s")
     return LabelledImages(np.stack(rgb), objects)
 
 
