@@ -132,7 +132,7 @@ def image_of(width: int, height: int, objects: np.ndarray, instance: np.ndarray,
 def test_labels_have_what_is_visible_and_its_nearest_point() -> None:
     instance, depth = np.zeros((40, 40), np.uint32), np.full((40, 40), 100.0, np.float32)
     instance[10:20, 5:15], depth[10:20, 5:15] = 7, 12.0
-    depth[15, 6] = 9.0
+    depth[15, [6, 12]] = 9.0  # as deep, but the second is nearer to the axis
     instance[10:20, 5], depth[10:20, 5] = 8, 2.0  # another object in the same box
     instance[30:35, 30:39], depth[30:35, 30:39] = 9, 50.0
     seen = np.zeros(4, SEEN)
@@ -143,7 +143,7 @@ def test_labels_have_what_is_visible_and_its_nearest_point() -> None:
     found = objects_of(image_of(40, 40, seen, instance, depth))
     assert found.boxes_px.tolist() == [[6, 10, 15, 20], [5, 10, 6, 20], [30, 30, 39, 35]]
     assert found.classes.tolist() == [Class.TRUCK, Class.TWO_WHEELER, Class.PERSON]
-    assert found.places.tolist()[:2] == [[6.5, 9.0], [5.5, 2.0]]
+    assert found.places.tolist()[:2] == [[12.5, 9.0], [5.5, 2.0]]
     # Too few pixels, and too low.
     assert found.ignored.tolist() == [False, True, True]
     # Hidden by more than two thirds; cut off by more than half.
@@ -207,6 +207,19 @@ def test_what_is_encoded_is_decoded() -> None:
             k == place for k in range(3)
         ]
     assert float(losses(far, labels, targets).place) == pytest.approx(2 * math.log(1.5), rel=1e-3)
+
+
+def test_only_the_highest_of_neighbouring_cells_is_an_object() -> None:
+    scores = np.zeros((1, len(Class), 4, 4), np.float32)
+    scores[0, Class.CAR, 1, :] = 0.6, 0.9, 0.7, 0.8
+    # Boxes that do not overlap, so that no other rule takes the lower ones away.
+    boxes_px = np.zeros((1, 4, 4, 4), np.float32)
+    boxes_px[0, [0, 2]] = np.array([[0, 4, 8, 12], [4, 8, 12, 16]], np.float32)[:, None]
+    boxes_px[0, 3] = 8.0
+    found = decode(scores, boxes_px, np.ones((1, 2, 4, 4), np.float32), least_score=0.3)[0]
+    assert found.scores.tolist() == pytest.approx([0.9, 0.8])
+    assert found.boxes_px[:, 0].tolist() == [4.0, 12.0]
+    assert len(decode(scores, boxes_px, np.ones((1, 2, 4, 4), np.float32), least_score=0.85)[0].scores) == 1
 
 
 def test_an_ignored_object_teaches_nothing() -> None:
@@ -286,6 +299,10 @@ def test_places_are_ahead_and_left_of_the_rear_axle() -> None:
     np.testing.assert_allclose(
         Mounting(down).body_m(*ahead), [[1.5 + 10 * math.cos(math.pi / 6), 0.25, -3.6]], atol=1e-6
     )
+    # Its up is ahead, too: 20 rows up are 2 m, of which half is ahead.
+    above = Mounting(down).body_m(ahead[0], np.array([30.0], np.float32))
+    wanted = [[2.5 + 10 * math.cos(math.pi / 6), 0.25, -3.6 + 2 * math.cos(math.pi / 6)]]
+    np.testing.assert_allclose(above, wanted, atol=1e-6)
     rolled = camera | {"mount": [0.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0]}
     right = Mounting(rolled).body_m(np.array([[50.0, 10.0]], np.float32), np.array([50.0], np.float32))
     np.testing.assert_allclose(right, [[10.0, 0.0, 5.0]], atol=1e-6)
@@ -344,6 +361,7 @@ def test_fields_have_the_nearest_objects_in_the_simulator_s_numbers(scale: str, 
     unit = (metres + RANGE_M) / (2 * RANGE_M)
     torch.testing.assert_close(filled[0, 1:], low + (1 - low) * unit)
     assert filled[0, 2] > low + (1 - low) / 2 > filled[0, 4]
+    assert objects.nearest_m(first)[2:].tolist() == [[RANGE_M, RANGE_M]] * 2
     # No object, and no camera.
     assert torch.equal(filled[1:, 1:], torch.ones(2, 4))
 

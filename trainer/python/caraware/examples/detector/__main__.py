@@ -25,7 +25,10 @@ LEAST_SCORE = 0.02
 
 def main(arguments: list[str] | None = None) -> None:
     """The command line."""
-    parsed = _parser().parse_args(arguments)
+    parser = _parser()
+    parsed = parser.parse_args(arguments)
+    if parsed.command != "train" and not parsed.file.exists():
+        parser.error(f"{parsed.file} does not exist: `train` writes it")
     torch.set_num_threads(1)  # of two cores the simulation needs one
     if parsed.command == "train":
         _train(parsed.file, parsed.steps, parsed.seed)
