@@ -44,7 +44,7 @@ fn sensing(width: u32, height: u32) -> impl FnOnce(&mut Config) {
 /// An image whose pixels are numbers that depend on the tick, with one road user.
 fn image(tick: u64, index: u32, width: u32, height: u32) -> (ImageLayout, Vec<u8>) {
     let bytes_of_planes: usize = PLANES.iter().map(|plane| plane.pixel_bytes()).sum();
-    let layout = ImageLayout::new(1, (width * height) as usize * bytes_of_planes);
+    let layout = ImageLayout::new(1, (width * height) as usize * bytes_of_planes, 0);
     let mut words = vec![0_u64; layout.len.div_ceil(8)];
     let payload: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
     view_mut::<ImageHead>(payload, layout.head).unwrap()[0] = ImageHead {

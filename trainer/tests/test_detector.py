@@ -25,7 +25,7 @@ from caraware.examples.detector.network import STRIDE, Cells, Labels, Losses, Ne
 from caraware.examples.detector.objects import DetectedObjects, Mounting
 from caraware.examples.detector.traffic import write_mixed_traffic
 from caraware.examples.detector.training import Settings, augmented, stacked, train
-from caraware.ipc.image import IMAGE, SEEN, Image, Label
+from caraware.ipc.image import EVENT, IMAGE, SEEN, Image, Label
 from caraware.ipc.mounts import MountedSensor
 from caraware.ipc.run_file import ConfigError
 from caraware.tasks.fields import Fields
@@ -126,7 +126,22 @@ def image_of(width: int, height: int, objects: np.ndarray, instance: np.ndarray,
     head = np.zeros(1, IMAGE)
     head["width"], head["height"], head["focal_px"] = width, height, focal_px(width, 90.0)
     mounted = MountedSensor("car", "", "camera", (0.0,) * 6, False)
-    return Image(0, 0, 0, mounted, head[0], objects, depth_m, instance, None, None, None)
+    return Image(
+        tick=0,
+        sim_time_ns=0,
+        vehicle=0,
+        mounted=mounted,
+        head=head[0],
+        objects=objects,
+        depth_m=depth_m,
+        instance=instance,
+        semantic=None,
+        rgb=None,
+        binary=None,
+        infrared=None,
+        flow_px=None,
+        events=np.zeros(0, EVENT),
+    )
 
 
 def test_labels_have_what_is_visible_and_its_nearest_point() -> None:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from caraware.data.export.scans import distortion, projection, undistorted_projection
+from caraware.data.recording import RecordingError
 from caraware.ipc.image import EVENT, IMAGE, PLANES, SEEN, split_planes
 from caraware.ipc.radar import DETECTION, RADAR_SCAN
 
@@ -53,3 +55,13 @@ def test_planes_that_are_too_short_are_refused() -> None:
     head["height"], head["width"], head["planes"] = 3, 5, 1
     with pytest.raises(ValueError, match="buffer"):
         split_planes(head[0], bytes(59))
+
+
+def test_formats_without_lenses_refuse_a_camera_that_has_one() -> None:
+    head = np.zeros(1, IMAGE)
+    head["width"], head["height"], head["focal_px"] = 8, 6, 4.0
+    np.testing.assert_array_equal(undistorted_projection(head[0]), projection(head[0]))
+    head["distortion"] = [-0.25, 0.125, 0.0, 0.5, 0.0]
+    assert distortion(head[0]) == [-0.25, 0.125, 0.0, 0.5, 0.0]
+    with pytest.raises(RecordingError, match="export to ros2 or foxglove"):
+        undistorted_projection(head[0])

@@ -129,21 +129,30 @@ def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
     return header(tick, len(rows), 1) + payload
 
 
-def image(tick: int, pixels: dict[str, np.ndarray], objects: Sequence[dict[str, Any]] = (), **head: Any) -> bytes:
-    """An image with these planes `[h, w]` or `[h, w, 3]`, and the road users in it."""
-    names = [name for name, _, _ in wire.PLANES]
+def image(
+    tick: int,
+    pixels: dict[str, np.ndarray],
+    objects: Sequence[dict[str, Any]] = (),
+    events: Sequence[tuple[int, int, int, int]] = (),
+    **head: Any,
+) -> bytes:
+    """An image with these planes, the road users in it, and events (µs, column, row, polarity)."""
     height, width = next(iter(pixels.values())).shape[:2]
     row = np.zeros(1, wire.IMAGE_HEAD)
     row["height"], row["width"], row["range_m"] = height, width, 100.0
-    row["planes"] = sum(1 << names.index(name) for name in pixels)
+    row["planes"] = sum(1 << bit for name, bit, *_ in wire.PLANES if name in pixels)
     for name, value in head.items():
         row[name] = value
-    content = b"".join(np.asarray(pixels[name], scalar).tobytes() for name, scalar, _ in wire.PLANES if name in pixels)
+    content = b"".join(
+        np.asarray(pixels[name], scalar).tobytes() for name, _, scalar, _ in wire.PLANES if name in pixels
+    )
     rows = np.zeros(len(objects), wire.SEEN_OBJECT)
     for seen, values in zip(rows, objects, strict=True):
         for name, value in values.items():
             seen[name] = value
-    return header(tick, len(objects), 1, len(content)) + padded(row.tobytes()) + padded(content) + rows.tobytes()
+    listed = np.array(list(events), wire.BRIGHTNESS_EVENT)
+    sections = [padded(section) for section in (row.tobytes(), content, rows.tobytes())]
+    return header(tick, len(objects), 1, len(content), len(events)) + b"".join(sections) + listed.tobytes()
 
 
 def radar(tick: int, detections: dict[str, Any], **scan: Any) -> bytes:

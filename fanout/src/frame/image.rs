@@ -1,4 +1,4 @@
-//! Frames of `image`: the whole message if it fits; else one plane, and of that one pixel of each block of k × k.
+//! Frames of `image`: the whole message if it fits; else one plane without events, and of that one pixel of each block of k × k.
 
 use bytemuck::bytes_of;
 use ipc_schema::{
@@ -10,9 +10,10 @@ use ipc_schema::{
 use super::{EncodedFrame, FrameError, HEADER_BYTES, MAX_SENSOR_BYTES};
 
 /// A frame that cannot have every plane has the first of these that the image has, else the first of [`ImagePlane::ALL`].
-const PREFERRED: [ImagePlane; 4] = [
+const PREFERRED: [ImagePlane; 5] = [
     ImagePlane::Rgb,
     ImagePlane::Semantic,
+    ImagePlane::Infrared,
     ImagePlane::Depth,
     ImagePlane::Binary,
 ];
@@ -86,7 +87,7 @@ fn reduced_size(head: &ImageHead, factor: u32) -> [u32; 2] {
 fn smallest_factor(head: &ImageHead, plane: ImagePlane, objects: usize) -> u32 {
     let fits = |factor: &u32| {
         let [width, height] = reduced_size(head, *factor).map(|size| size as usize);
-        HEADER_BYTES + ImageLayout::new(objects, width * height * plane.pixel_bytes()).len <= MAX_SENSOR_BYTES
+        HEADER_BYTES + ImageLayout::new(objects, width * height * plane.pixel_bytes(), 0).len <= MAX_SENSOR_BYTES
     };
     let most = head.width.max(head.height).max(1);
     (1..most).find(fits).unwrap_or(most)
@@ -125,7 +126,7 @@ fn reduced(
         ..*head
     };
     let objects: Vec<SeenObject> = objects.iter().map(|object| in_blocks(object, factor)).collect();
-    let layout = ImageLayout::new(objects.len(), pixels.len());
+    let layout = ImageLayout::new(objects.len(), pixels.len(), 0);
     let header = MessageHeader {
         shape: layout.shape,
         ..*header

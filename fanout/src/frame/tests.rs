@@ -195,7 +195,7 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
 /// An image of `width` × `height` pixels with these planes, whose bytes are numbered, and one road user in columns 600 to 900.
 fn image(width: u32, height: u32, planes: &[ImagePlane]) -> (ImageLayout, Vec<u64>) {
     let bytes_of_planes: usize = planes.iter().map(|plane| plane.pixel_bytes()).sum();
-    let layout = ImageLayout::new(1, bytes_of_planes * (width * height) as usize);
+    let layout = ImageLayout::new(1, bytes_of_planes * (width * height) as usize, 0);
     let mut words = payload(layout.len);
     let bytes: &mut [u8] = cast_slice_mut(&mut words);
     view_mut::<ImageHead>(bytes, layout.head).unwrap()[0] = ImageHead {
@@ -233,9 +233,10 @@ fn an_image_that_fits_goes_out_as_it_is() {
 /// Of a large image one plane remains, and of that the pixel amid each block; whatever is in pixels is in those of the frame's image.
 #[test]
 fn an_image_that_does_not_fit_has_one_plane_and_fewer_pixels() {
-    use ImagePlane::{Binary, Depth, Instance, Rgb, Semantic};
+    use ImagePlane::{Binary, Depth, Infrared, Instance, Rgb, Semantic};
     for (planes, kept, before, factor) in [
-        (&ImagePlane::ALL[..], Rgb, 9, 2),
+        (&ImagePlane::ALL[..], Rgb, 19, 2),
+        (&[Depth, Instance, Infrared], Infrared, 8, 2),
         (&[Depth, Instance, Semantic], Semantic, 8, 1),
         (&[Depth, Instance, Binary], Depth, 0, 2),
         (&[Instance, Binary], Binary, 4, 1),

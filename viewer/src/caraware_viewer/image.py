@@ -81,6 +81,34 @@ def _grey(values: NDArray[np.uint8], _: wire.CameraImage) -> NDArray[np.uint8]:
     return np.repeat(values[..., None], 3, axis=-1)
 
 
+def _by_heat(kelvins: NDArray[np.uint16], image: wire.CameraImage) -> NDArray[np.uint8]:
+    """Grey from the coldest to the warmest pixel of the image, as with automatic gain: white is warm."""
+    low, high = int(kelvins.min()), int(kelvins.max())
+    return _grey((255.0 * (kelvins.astype(np.float32) - low) / max(high - low, 1)).astype(np.uint8), image)
+
+
+def _by_motion(flow_px: NDArray[np.float32], _: wire.CameraImage) -> NDArray[np.uint8]:
+    """The hue says where to, the saturation how far, up to the farthest of the image; unknown motion is black."""
+    known = np.isfinite(flow_px[..., :1]) & np.isfinite(flow_px[..., 1:])
+    right, down = np.where(known, flow_px, 0.0).transpose(2, 0, 1)
+    length = np.hypot(right, down)
+    share = length / max(float(length.max()), 1.0)
+    # A sixth of the hue circle from one of these to the next, as in any conversion from HSV.
+    sixth = (np.arctan2(down, right) / (2 * np.pi) % 1.0)[..., None] * 6.0
+    pure = np.clip(np.abs((sixth + np.array([0.0, 4.0, 2.0])) % 6.0 - 3.0) - 1.0, 0.0, 1.0)
+    shown: NDArray[np.float64] = 255.0 * (1.0 - share[..., None] * (1.0 - pure)) * known
+    return shown.astype(np.uint8)
+
+
+def _with_events(shown: NDArray[np.uint8], events: NDArray[np.void]) -> NDArray[np.uint8]:
+    """The image, darker, with the newest event of each pixel: red became brighter, blue darker."""
+    height, width, _ = shown.shape
+    within = events[(events["x"] < width) & (events["y"] < height)]
+    shown = shown // 2
+    shown[within["y"], within["x"]] = np.where(within["polarity"][:, None] > 0, (255, 40, 40), (60, 90, 255))
+    return shown
+
+
 def _by_number(numbers: NDArray[np.uint32], _: wire.CameraImage) -> NDArray[np.uint8]:
     """A colour for each number, the same in every image."""
     mixed = numbers * np.uint32(0x9E37_79B1)
@@ -90,8 +118,10 @@ def _by_number(numbers: NDArray[np.uint32], _: wire.CameraImage) -> NDArray[np.u
 PAINTERS: dict[str, Callable[[NDArray[Any], wire.CameraImage], NDArray[np.uint8]]] = {
     "rgb": _as_it_is,
     "semantic": _by_label,
+    "infrared": _by_heat,
     "depth_m": _by_depth,
     "binary": _grey,
+    "flow_px": _by_motion,
     "instance": _by_number,
 }
 """How a plane becomes colours `[h, w, 3]`, by its name in `wire.PLANES`: the first that an image has is drawn."""
@@ -101,7 +131,8 @@ def colors(image: wire.CameraImage) -> NDArray[np.uint8]:
     """RGB `[h, w, 3]` of an image. Raises `wire.FrameError` if it has no plane that can be drawn, or no pixel."""
     for name, paint in PAINTERS.items():
         if name in image.planes and image.planes[name].size:
-            return paint(image.planes[name], image)
+            shown = paint(image.planes[name], image)
+            return _with_events(shown, image.events) if len(image.events) else shown
     raise FrameError(f"an image has no plane that this viewer draws; it has {', '.join(image.planes) or 'none'}")
 
 

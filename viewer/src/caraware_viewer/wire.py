@@ -53,14 +53,18 @@ IMAGE_HEAD = RECORDS["ImageHead"]
 """Pose of a camera at the end of the tick, and the size of its image."""
 SEEN_OBJECT = RECORDS["SeenObject"]
 """A road user of which an image shows a pixel: its class, boxes (pixels) and depths (metres)."""
-PLANES: tuple[tuple[str, str, tuple[int, ...]], ...] = (
-    ("depth_m", "<f4", ()),
-    ("instance", "<u4", ()),
-    ("semantic", "|u1", ()),
-    ("rgb", "|u1", (3,)),
-    ("binary", "|u1", ()),
+PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = (
+    ("depth_m", 0, "<f4", ()),
+    ("instance", 1, "<u4", ()),
+    ("flow_px", 6, "<f4", (2,)),
+    ("infrared", 5, "<u2", ()),
+    ("semantic", 2, "|u1", ()),
+    ("rgb", 3, "|u1", (3,)),
+    ("binary", 4, "|u1", ()),
 )
-"""Name, scalar and shape of a pixel of each plane of an image, in their order; the place is the bit in `planes`."""
+"""Name, bit in `planes`, scalar and shape of a pixel of each plane of an image, in their order."""
+BRIGHTNESS_EVENT = RECORDS["BrightnessEvent"]
+"""A pixel became brighter or darker: time since the begin of the tick (µs), column, row, polarity."""
 RADAR_SCAN = RECORDS["RadarScan"]
 """Pose of a radar at the end of the tick; x forward, y left, z up."""
 RADAR_DETECTION = RECORDS["RadarDetection"]
@@ -213,9 +217,11 @@ class CameraImage:
     head: np.void
     """`IMAGE_HEAD`."""
     planes: dict[str, NDArray[Any]]
-    """The planes that the frame has, `[h, w]` and `[h, w, 3]`, by their names in `PLANES`."""
+    """The planes that the frame has, `[h, w]`, `[h, w, 2]` and `[h, w, 3]`, by their names in `PLANES`."""
     objects: NDArray[np.void]
     """`SEEN_OBJECT [count]`."""
+    events: NDArray[np.void]
+    """`BRIGHTNESS_EVENT [count]`."""
 
 
 @dataclass(frozen=True)
@@ -289,7 +295,7 @@ def decode_cloud(frame: bytes) -> PointCloud:
 
 
 def decode_image(frame: bytes) -> CameraImage:
-    """An `image/<id>` frame. Planes that a later version adds come behind the others, and are skipped."""
+    """An `image/<id>` frame."""
     header = decode_header(frame)
     sections = _sections(frame, "image", header)
     if len(sections["head"]) != 1:
@@ -299,7 +305,7 @@ def decode_image(frame: bytes) -> CameraImage:
     content = sections["planes"].tobytes()
     planes: dict[str, NDArray[Any]] = {}
     offset = 0
-    for bit, (name, scalar, shape) in enumerate(PLANES):
+    for name, bit, scalar, shape in PLANES:
         if int(head["planes"]) >> bit & 1 == 0:
             continue
         count = math.prod((*size, *shape))
@@ -308,7 +314,7 @@ def decode_image(frame: bytes) -> CameraImage:
             raise FrameError(f"the planes of an image of {size[1]} x {size[0]} pixels have {len(content)} bytes")
         planes[name] = np.frombuffer(content, scalar, count, offset).reshape((*size, *shape))
         offset += length
-    return CameraImage(header, head, planes, sections["objects"])
+    return CameraImage(header, head, planes, sections["objects"], sections["events"])
 
 
 def decode_detections(frame: bytes) -> RadarDetections:

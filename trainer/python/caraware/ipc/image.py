@@ -1,4 +1,4 @@
-"""Images of cameras: depths, objects, classes, colours, temperatures, optical flow, events, and the road users in them."""
+"""Images of cameras: depths, objects, classes, colours, temperatures, optical flow, events, and road users in them."""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ SEEN = record("SeenObject")
 """`SeenObject`: a road user of which an image shows a pixel, its visible and its full box (pixels), its depths (m)."""
 
 EVENT = record("BrightnessEvent")
-"""`BrightnessEvent`: a pixel became brighter or darker: time since the begin of the tick (µs), column, row, polarity."""
+"""`BrightnessEvent`: a pixel became brighter or darker: time since the begin of the tick (µs), column, row, sign."""
 
 SKY = 0xFFFF_FFFE
 """`instance` of a pixel that sees the sky."""
@@ -119,7 +119,7 @@ class Image:
     infrared: NDArray[np.uint16] | None
     """u16 [height, width]: apparent temperature in the thermal infrared, 0.01 K."""
     flow_px: Float32Array | None
-    """f32 [height, width, 2]: how far what the pixel shows has moved to the right and down within `camera.period_s`, pixels;
+    """f32 [height, width, 2]: how far what the pixel shows has moved right and down within `camera.period_s`, pixels;
     not a number where it was not in front of the camera then, and in the first image of an episode."""
     events: NDArray[np.void]
     """`EVENT [count]`, read-only: the events of the tick in the order of time; empty without `camera.events`."""

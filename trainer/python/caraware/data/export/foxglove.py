@@ -31,7 +31,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
 from caraware.data.export.card import source
-from caraware.data.export.scans import projection, quaternion
+from caraware.data.export.scans import distortion, projection, quaternion
 from caraware.data.export.streams import (
     COLOURS,
     WORLD,
@@ -167,6 +167,8 @@ class FoxgloveSink:
             frame_id=frame,
             width=int(head["width"]),
             height=int(head["height"]),
+            distortion_model="plumb_bob",
+            D=distortion(head),
             K=matrix[:, :3].ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
             P=matrix.ravel().tolist(),

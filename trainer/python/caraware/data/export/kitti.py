@@ -31,9 +31,9 @@ from caraware.data.export.scans import (
     box_middle,
     class_by_size,
     inverse,
-    projection,
     require_channels,
     rotated,
+    undistorted_projection,
     upright_pose,
     vehicle_pose,
 )
@@ -146,9 +146,9 @@ class Calibration:
             if image is None:
                 return np.eye(3, 4)
             if image is reference:
-                return projection(image.head)
+                return undistorted_projection(image.head)
             own_from_reference = rotated(OPTICAL) @ inverse(image.world_from_sensor) @ world_from_reference
-            matrix: Float64Array = projection(image.head) @ own_from_reference
+            matrix: Float64Array = undistorted_projection(image.head) @ own_from_reference
             return matrix
 
         return cls(

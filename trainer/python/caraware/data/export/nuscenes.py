@@ -37,10 +37,10 @@ from caraware.data.export.scans import (
     box_middle,
     class_by_size,
     inverse,
-    projection,
     quaternion,
     require_channels,
     rotated,
+    undistorted_projection,
     upright_pose,
     vehicle_pose,
 )
@@ -270,7 +270,7 @@ class _Scene:
 
     def _calibration(self, channel: str, ego_from_sensor: Float64Array, camera: np.void | None) -> str:
         """The token of a sensor's mounting; one that has not changed by more than the rounding of poses is the same."""
-        intrinsic = [] if camera is None else projection(camera)[:, :3].tolist()
+        intrinsic = [] if camera is None else undistorted_projection(camera)[:, :3].tolist()
         known = self.token(channel, np.round(ego_from_sensor, 4).tolist(), intrinsic)
         if known not in self.calibrations:
             self.calibrations.add(known)

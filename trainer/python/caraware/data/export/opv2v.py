@@ -22,7 +22,7 @@ from caraware.data.export.frames import (
     delivered_sensors,
     frames,
 )
-from caraware.data.export.scans import box_middle, projection, require_channels
+from caraware.data.export.scans import box_middle, require_channels, undistorted_projection
 from caraware.data.export.sensors import Omission, lack_colours, left_out, left_out_without
 from caraware.data.recording import Array, Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array, FloatArray
@@ -158,7 +158,7 @@ def _camera(image: CameraImage, main: LidarScan) -> str:
     world_from_camera, world_from_lidar = (world_from_pose(_sensor_pose(sensor)) for sensor in (image, main))
     parts = {
         "cords": _sensor_pose(image),
-        "intrinsic": projection(image.head)[:, :3].tolist(),
+        "intrinsic": undistorted_projection(image.head)[:, :3].tolist(),
         "extrinsic": (np.linalg.inv(world_from_camera) @ world_from_lidar).tolist(),
     }
     return "".join(f"\n  {name}: {value}" for name, value in parts.items())

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from caraware.data.export.card import source
-from caraware.data.export.scans import projection, quaternion
+from caraware.data.export.scans import distortion, projection, quaternion
 from caraware.data.export.streams import (
     COLOURS,
     WORLD,
@@ -219,7 +219,7 @@ class Ros2Sink:
             height=int(head["height"]),
             width=int(head["width"]),
             distortion_model="plumb_bob",
-            d=np.zeros(5),
+            d=np.array(distortion(head)),
             k=matrix[:, :3].ravel(),
             r=np.eye(3).ravel(),
             p=matrix.ravel(),

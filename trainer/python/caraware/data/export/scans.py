@@ -93,7 +93,22 @@ def quaternion(rotation: Float64Array) -> list[float]:
     return [float(value) for value in (vector if vector[0] >= 0 else -vector)]
 
 
+def distortion(head: np.void) -> list[float]:
+    """The lens of an image: k1, k2, p1, p2, k3 of Brown's model, which ROS and Foxglove call "plumb_bob"."""
+    return [float(part) for part in head["distortion"]]
+
+
+def undistorted_projection(head: np.void) -> Float64Array:
+    """As `projection`, for formats of images without distortion. Raises `RecordingError` of a camera with a lens."""
+    if any(distortion(head)):
+        raise RecordingError(
+            "this format holds images without lens distortion, but a recorded camera has a lens: record it with "
+            "camera.distortion = [0.0, 0.0, 0.0, 0.0, 0.0], or export to ros2 or foxglove, which name the lens"
+        )
+    return projection(head)
+
+
 def projection(head: np.void) -> Float64Array:
-    """f64 [3, 4]: the pinhole of an image (docs/camera.md)."""
+    """f64 [3, 4]: the pinhole of an image (docs/camera.md), without its lens."""
     focal, width, height = float(head["focal_px"]), int(head["width"]), int(head["height"])
     return np.array([[focal, 0, (width - 1) / 2, 0], [0, focal, (height - 1) / 2, 0], [0, 0, 1, 0]])

@@ -50,7 +50,7 @@ def pixels(entity: Any) -> np.ndarray:
 def test_every_plane_comes_back_whatever_others_there_are() -> None:
     random = np.random.default_rng(3)
     every = {
-        name: random.integers(0, 256, (3, 4, *shape)).astype(np.dtype(scalar)) for name, scalar, shape in wire.PLANES
+        name: random.integers(0, 256, (3, 4, *shape)).astype(np.dtype(scalar)) for name, _, scalar, shape in wire.PLANES
     }
     for names in ([*every], ["depth_m", "rgb"], ["instance"], ["semantic", "binary"]):
         chosen: dict[str, Any] = {name: every[name] for name in names}
@@ -97,6 +97,27 @@ def test_the_most_telling_plane_is_drawn() -> None:
     np.testing.assert_array_equal(shown("binary")[..., 1], binary)
     with pytest.raises(FrameError, match="no plane"):
         image.colors(wire.decode_image(frames.image(0, {"rgb": np.zeros((0, 4, 3))})))
+
+
+def test_heat_motion_and_events_are_drawn() -> None:
+    heat = np.array([[28_000, 29_000], [30_000, 28_500]], np.uint16)
+    flow = np.array([[[0, 0], [2, 0]], [[-2, 0], [np.nan, np.nan]]], np.float32)
+
+    def shown(plane: str, pixels: Any, **more: Any) -> np.ndarray:
+        return image.colors(wire.decode_image(frames.image(0, {plane: pixels}, **more)))
+
+    assert shown("infrared", heat)[..., 1].tolist() == [[0, 127], [255, 63]]
+    # At rest white; to the right red, to the left its complement; unknown black.
+    assert shown("flow_px", flow).tolist() == [[[255] * 3, [255, 0, 0]], [[0, 255, 255], [0] * 3]]
+    events = [(10, 1, 0, 1), (20, 1, 0, -1), (30, 0, 1, 1), (40, 7, 9, 1)]
+    with_events = shown("infrared", heat, events=events)
+    assert with_events.tolist() == [[[0] * 3, [60, 90, 255]], [[255, 40, 40], [31] * 3]]
+    assert wire.decode_image(frames.image(0, {"infrared": heat}, events=events)).events["time_us"].tolist() == [
+        10,
+        20,
+        30,
+        40,
+    ]
 
 
 def test_a_chosen_camera_is_drawn_with_boxes_beside_the_3d_view(drawn: Drawn) -> None:
