@@ -254,9 +254,15 @@ impl Canvas {
         let LinearForm(plane) = ground.unwrap_or(LinearForm([0.0; 3]));
         let [ground_word, sky_word] = [GROUND_SURFACE, SKY_SURFACE].map(|word| S::floats(S::splat_words(word)));
         for row in 0..self.b.len() {
+            let by_row = S::splat(self.b[row]) * S::splat(plane[2]);
             for tile in 0..tiles_x {
-                let [a, b] = self.rays::<S>(tile, row);
-                let inverse = LinearForm(plane).along::<S>(a) + b * S::splat(plane[2]);
+                let inverse = match self.bent {
+                    None => LinearForm(plane).along::<S>(S::load(&self.a[tile])) + by_row,
+                    Some(_) => {
+                        let [a, b] = self.rays::<S>(tile, row);
+                        LinearForm(plane).along::<S>(a) + b * S::splat(plane[2])
+                    }
+                };
                 let is_ground = S::lt(sky, inverse);
                 let place = row * tiles_x + tile;
                 S::store(S::select(is_ground, inverse, sky), &mut self.inverse[place]);

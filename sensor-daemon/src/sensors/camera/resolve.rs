@@ -106,11 +106,8 @@ struct Pixels {
     surface: Words,
     /// Class of the pixels on the ground.
     label: [u8; WIDTH],
-    /// Share of the light that reaches the camera, and of the thermal infrared.
+    /// Share of the light that reaches the camera.
     clear: Floats,
-    thermal_clear: Floats,
-    /// Inverse of the depth, 1/m.
-    inverse: Floats,
 }
 
 impl Resolver<'_> {
@@ -130,6 +127,9 @@ impl Resolver<'_> {
                 let pixels = self.sixteen::<S>(tile, row, &axes, planes);
                 let at = row * optics.width + first;
                 self.put(&pixels, at, count, planes);
+                if let Some(infrared) = planes.infrared.get_mut(at..at + count) {
+                    self.put_infrared::<S>(&pixels, infrared);
+                }
                 if let Some(flow_px) = planes.flow_px.get_mut(at..at + count) {
                     self.put_flow(&pixels, [tile, row], flow_px);
                 }
@@ -157,8 +157,6 @@ impl Resolver<'_> {
             surface: self.canvas.surface[place],
             label: [SemanticLabel::Terrain as u8; WIDTH],
             clear: Floats::ZERO,
-            thermal_clear: Floats::ZERO,
-            inverse: self.canvas.inverse[place],
         };
         S::store(depth, &mut pixels.depth);
         let ground = S::equal(S::load_words(&pixels.surface), S::splat_words(GROUND_SURFACE));
@@ -166,12 +164,9 @@ impl Resolver<'_> {
         if needs_class && S::bits(ground) != 0 {
             self.classes::<S>(depth, tile, row, axes, S::bits(ground), &mut pixels.label);
         }
-        let clear = |extinction_per_m: f32| crate::sensors::lidar::exp_minus::<S>(depth * S::splat(extinction_per_m));
         if planes.have_colours() {
-            S::store(clear(self.light.extinction_per_m), &mut pixels.clear);
-        }
-        if !planes.infrared.is_empty() {
-            S::store(clear(self.thermal.extinction_per_m), &mut pixels.thermal_clear);
+            let clear = crate::sensors::lidar::exp_minus::<S>(depth * S::splat(self.light.extinction_per_m));
+            S::store(clear, &mut pixels.clear);
         }
         pixels
     }
@@ -239,7 +234,7 @@ impl Resolver<'_> {
                 };
             }
         }
-        if !planes.have_colours() && planes.infrared.is_empty() {
+        if !planes.have_colours() {
             return;
         }
         let sky = self.light.sky();
@@ -264,14 +259,20 @@ impl Resolver<'_> {
                 *to = 0.2126 * red + 0.7152 * green + 0.0722 * blue;
             }
         }
-        if let Some(infrared) = planes.infrared.get_mut(at..at + count) {
-            for (element, to) in infrared.iter_mut().enumerate() {
-                let radiance = match pixels.surface.0[element] {
-                    GROUND_SURFACE => self.thermal.of(pixels.label[element]),
-                    surface => self.thermal.of(table[surface as usize].label),
-                };
-                *to = self.thermal.pixel(radiance, pixels.thermal_clear.0[element]);
-            }
+    }
+
+    /// Apparent temperatures of the pixels of a tile's row.
+    #[inline(always)]
+    fn put_infrared<S: Simd>(&self, pixels: &Pixels, infrared: &mut [u16]) {
+        let mut clear = Floats::ZERO;
+        let depths = S::load(&pixels.depth) * S::splat(self.thermal.extinction_per_m);
+        S::store(crate::sensors::lidar::exp_minus::<S>(depths), &mut clear);
+        for (element, to) in infrared.iter_mut().enumerate() {
+            let radiance = match pixels.surface.0[element] {
+                GROUND_SURFACE => self.thermal.of(pixels.label[element]),
+                surface => self.thermal.of(self.surfaces.surfaces[surface as usize].label),
+            };
+            *to = self.thermal.pixel(radiance, clear.0[element]);
         }
     }
 
@@ -279,6 +280,7 @@ impl Resolver<'_> {
     #[inline(always)]
     fn put_flow(&self, pixels: &Pixels, [tile, row]: [usize; 2], flow_px: &mut [[f32; 2]]) {
         let optics = self.view.optics;
+        let inverses = &self.canvas.inverse[row * self.canvas.tiles[0] + tile];
         for (element, to) in flow_px.iter_mut().enumerate() {
             let surface = pixels.surface.0[element];
             let seen = &self.surfaces.surfaces[surface as usize];
@@ -286,7 +288,7 @@ impl Resolver<'_> {
             let inverse = if surface == SKY_SURFACE {
                 0.0
             } else {
-                pixels.inverse.0[element]
+                inverses.0[element]
             };
             *to = match self.motions.of(seen.user) {
                 Some(motion) => motion.flow_px(self.canvas.ray(tile, row, element), inverse, optics),
