@@ -195,6 +195,41 @@ fn no_client_may_write() {
     }
 }
 
+/// Reading is not writing: neither a subscription nor a query counts as a sample.
+#[test]
+fn what_a_client_reads_is_not_counted_as_written() {
+    let run = Run::new("reader", Mode::Simulate);
+    let _fanout = start_listening(&run);
+    let reader = until_connected(|| connect(&run, ""));
+    until_alive(&run, &reader);
+    let topics = [
+        Topic::World,
+        Topic::Vehicles,
+        Topic::Observation,
+        Topic::Event,
+        Topic::Status,
+    ];
+    let _seen = topics.map(|topic| harness::watch(&reader, run.key(topic)));
+    let _all = harness::watch(&reader, "caraware/**".into());
+    for _ in 0..3 {
+        for topic in topics {
+            let _ = ask(&reader, &run.key(topic));
+        }
+    }
+    // The count of a status is newer than all that was read before a sample that is denied.
+    let writer = until_connected(|| connect(&run, ""));
+    writer.put(run.key(Topic::World), "forged").wait().unwrap();
+    let counted = || {
+        let status = ask(&reader, &run.key(Topic::Status)).unwrap_or_default();
+        let status: serde_json::Value = serde_json::from_slice(&status).unwrap_or_default();
+        status["fanout"]["refused_samples"].as_u64()
+    };
+    until("the count of the one sample", || {
+        counted().is_some_and(|count| count > 0)
+    });
+    assert_eq!(counted(), Some(1));
+}
+
 /// By default no client may command, not even one on this machine.
 #[test]
 fn without_commanders_no_client_may_command() {

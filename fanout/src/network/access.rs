@@ -4,6 +4,7 @@
 //! `fanout.commanders` may query [`COMMAND`]; no client may write.
 
 use std::{
+    cell::RefCell,
     path::Path,
     sync::{
         Mutex, PoisonError,
@@ -131,9 +132,48 @@ pub fn forged_samples() -> u64 {
     FORGED.load(Ordering::Relaxed)
 }
 
-/// The module of zenoh that logs each message that access control drops, at level trace, and the texts that it logs for writing.
+/// The module of zenoh that logs each check of access control, at level trace, and the texts that it logs for denied writing.
 const ACCESS_CONTROL_LOG: &str = "zenoh::net::routing::interceptor::access_control";
 const DENIED: [&str; 2] = ["unauthorized to Put (ingress)", "unauthorized to Delete (ingress)"];
+/// When a client declares a key, zenoh checks all that the client might do there, in this order and without a pause. None of that is a
+/// sample.
+const CHECKS_OF_A_KEY: [&str; 4] = [
+    "Query (ingress)",
+    "Reply (ingress)",
+    "Put (ingress)",
+    "Delete (ingress)",
+];
+
+thread_local! {
+    static ACCESS_LOG: RefCell<AccessLog> = RefCell::default();
+}
+
+/// Tells samples that access control drops from its checks of declared keys, line by line of one thread's log.
+#[derive(Debug, Default)]
+struct AccessLog {
+    /// Place among [`CHECKS_OF_A_KEY`] and key of the line before, if all lines from the first check on were of one declared key.
+    last: Option<(usize, String)>,
+}
+
+impl AccessLog {
+    /// True if a line is about a sample that was dropped.
+    fn is_dropped_sample(&mut self, line: &str) -> bool {
+        let check = CHECKS_OF_A_KEY.iter().position(|check| line.contains(check));
+        let key = line.rsplit_once(" on ").map_or("", |(_, key)| key);
+        // A key that is known is not checked again: the line is about a message.
+        let is_known = line.starts_with("Using cached result");
+        // Every subject of a client has a line of its own.
+        let continues = match (check, &self.last) {
+            (Some(check), Some((last, last_key))) => (*last..=last + 1).contains(&check) && last_key == key,
+            _ => false,
+        };
+        self.last = match check {
+            Some(check) if !is_known && (check == 0 || continues) => Some((check, key.to_owned())),
+            _ => None,
+        };
+        self.last.is_none() && DENIED.iter().any(|denied| line.contains(denied))
+    }
+}
 
 /// Modules of zenoh that log why a connection was refused, at level debug, and how that text begins.
 const REFUSAL_LOGS: [(&str, &str); 3] = [
@@ -160,7 +200,7 @@ impl<S: Subscriber> Layer<S> for RefusalLayer {
         event.record(&mut message);
         let text = message.0;
         if target == ACCESS_CONTROL_LOG {
-            if DENIED.iter().any(|denied| text.contains(denied)) {
+            if ACCESS_LOG.with_borrow_mut(|log| log.is_dropped_sample(&text)) {
                 FORGED.fetch_add(1, Ordering::Relaxed);
             }
             return;
@@ -218,6 +258,40 @@ mod tests {
         config.fanout.listen = listen.parse().unwrap();
         config.fanout.commanders = commanders.iter().map(|name| name.parse().unwrap()).collect();
         config.fanout
+    }
+
+    #[test]
+    fn checks_of_a_declared_key_are_no_samples() {
+        let denied =
+            |line: &str, key: &str| format!("5c9 on default is unauthorized to {line} (ingress) on caraware/{key}");
+        let allowed =
+            |line: &str, key: &str| format!("5c9 on default is authorized to {line} (ingress) on caraware/{key}");
+        let cached = |line: &str| format!("Using cached result: 5c9 is unauthorized to {line} (ingress) on caraware/a");
+        let mut log = AccessLog::default();
+        let mut dropped = |lines: &[String]| lines.iter().filter(|line| log.is_dropped_sample(line)).count();
+        let declared = |key: &str| {
+            let query = allowed("Query", key);
+            [
+                query,
+                denied("Reply", key),
+                denied("Put", key),
+                denied("Delete", key),
+                allowed("Declare Subscriber", key),
+            ]
+        };
+        assert_eq!(dropped(&declared("a")), 0);
+        assert_eq!(dropped(&[denied("Put", "a"), denied("Delete", "a")]), 2, "undeclared");
+        assert_eq!(dropped(&[cached("Put"), cached("Delete")]), 2, "declared before");
+        assert_eq!(dropped(&[declared("a"), declared("b")].concat()), 0);
+        // A client of two subjects.
+        assert_eq!(dropped(&declared("a").map(|line| [line.clone(), line]).concat()), 0);
+        // A query, and a sample on another key.
+        assert_eq!(dropped(&[allowed("Query", "a"), denied("Put", "b")]), 1);
+        assert_eq!(
+            dropped(&[allowed("Query", "a"), denied("Put", "a")]),
+            1,
+            "no check skips the reply"
+        );
     }
 
     #[test]
