@@ -93,7 +93,7 @@ fn promised(topic: &str, header: &MessageHeader) -> Option<usize> {
             // The last section of what a mounted sensor sends.
             let last = match topic.split_once('/')?.0 {
                 "pointcloud" => PointcloudLayout::of(header).points,
-                "image" => ImageLayout::of(header).objects,
+                "image" => ImageLayout::of(header).events,
                 "radar" => RadarLayout::of(header).detections,
                 _ => return None,
             };
@@ -159,6 +159,15 @@ mod tests {
         );
         assert_eq!(check("status", b"{", None), Err(SampleRefusal::Json));
         assert_eq!(check("other", &whole, None), Err(SampleRefusal::Unknown));
+        // An image ends with its events.
+        let mut image = frame(SCHEMA_VERSION, 0, 40);
+        image[std::mem::offset_of!(MessageHeader, shape) + 12] = 6;
+        let Err(SampleRefusal::Short { promised, .. }) = check("image/a", &image, None) else {
+            panic!("six events without room");
+        };
+        image.resize(promised, 0);
+        assert!(check("image/a", &image, None).is_ok());
+        assert!(promised >= frame::HEADER_BYTES + 6 * size_of::<ipc_schema::image::BrightnessEvent>());
     }
 
     proptest! {
