@@ -32,8 +32,10 @@ NEVER_RUN = {
     "docs/remote.md": 4,
     "docs/sensor-models.md": 1,
     "docs/vehicle-model.md": 1,
+    "docs/viewer.md": 1,
 }
-"""Blocks that no mode runs: they need another machine, a container engine or a place outside, or write the checkout."""
+"""Blocks that no mode runs: they need another machine, a container engine or a place outside, a run of their own kind, or
+write the checkout."""
 
 
 BYTECODE = ROOT / "target" / "tmp" / "bytecode"
