@@ -34,8 +34,8 @@ NEVER_RUN = {
     "docs/vehicle-model.md": 1,
     "docs/viewer.md": 1,
 }
-"""Blocks that no mode runs: they need another machine, a container engine or a place outside, a run of their own kind, or
-write the checkout."""
+"""Blocks that no mode runs: they need another machine, a container engine, a run of their own kind or a place outside,
+or write the checkout."""
 
 
 BYTECODE = ROOT / "target" / "tmp" / "bytecode"
