@@ -71,7 +71,7 @@ $(VENV)/.sumo: requirements.lock
 
 # The pins are in requirements.lock; the packages of this project are installed in place.
 $(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/requirements-devkits.txt trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
-	@echo "installing Python's packages into $(VENV): $(if $(filter 1,$(GPU)),7 GB on disk,3.2 GB on disk, and no CUDA: GPU=1 installs it)"
+	@echo "installing Python's packages into $(VENV): $(if $(filter 1,$(GPU)),7 GB on disk,3.3 GB on disk, and no CUDA: GPU=1 installs it)"
 	$(call PINS,$(VENV))
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps -r trainer/requirements-devkits.txt
 	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
