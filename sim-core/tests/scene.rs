@@ -16,7 +16,7 @@ use ipc_schema::{
     config::Config,
     run::{MapInfo, Mode, RunFile, ScenarioOptions, SceneFiles, SharedMemory, Source},
 };
-use sim_core::scene::{Scene, SceneError, Solid, SurfaceKind, chart::Chart, shape};
+use sim_core::scene::{Road, RoadPiece, Scene, SceneError, Solid, SurfaceKind, chart::Chart, shape};
 
 /// The SUMO that `make build` installed, or that `CARAWARE_SUMO_HOME` names.
 fn sumo_home() -> PathBuf {
@@ -280,12 +280,42 @@ fn a_net_with_elevation_gives_heights_and_distinguishes_bridges() {
     let [house, tower] = scene.buildings() else {
         panic!("{:?}", scene.buildings())
     };
-    assert_eq!(
-        (house.base_z_m, house.height_m),
-        (2.0, 7.0),
-        "on the road nearest to it"
-    );
+    // Beside the slope, its lowest corners at x = 20 m.
+    assert!((house.base_z_m - 4.0).abs() < 1e-9, "{}", house.base_z_m);
+    assert_eq!(house.height_m, 7.0);
     assert_eq!((tower.base_z_m, tower.height_m), (5.0, 30.0), "as its own shape says");
+}
+
+/// A road is one long segment where it is straight, however far it climbs.
+#[test]
+fn the_ground_beside_a_slope_is_as_high_as_the_road_beside_it() {
+    let piece = |id: &str, half_width_m, shape_m: &[[f64; 3]]| RoadPiece {
+        id: id.into(),
+        surface: SurfaceKind::Lane,
+        shape_m: shape_m.to_vec(),
+        half_width_m,
+        junctions: [u32::MAX; 2],
+    };
+    let lane = piece("climb_0", Some(3.0), &[[0.0, 0.0, 100.0], [1000.0, 0.0, 160.0]]);
+    let square = [
+        [1000.0, -40.0, 160.0],
+        [1080.0, -40.0, 164.0],
+        [1080.0, 40.0, 164.0],
+        [1000.0, 40.0, 160.0],
+    ];
+    let road = Road::new(vec![lane, piece(":top_0", None, &square)]);
+    let scene = Scene::new(road, Vec::new(), Vec::new());
+    for x_m in [0.0, 1.0, 250.0, 499.0, 750.0, 940.0] {
+        for y_m in [0.0, 2.9, 3.2, -10.0, 24.0, -60.0] {
+            let off_m = scene.ground_height_m(x_m, y_m) - (100.0 + 0.06 * x_m);
+            assert!(off_m.abs() < 1e-9, "{off_m} at {x_m}, {y_m}");
+        }
+    }
+    // Beside the square, along its edge of 80 m.
+    for x_m in [1010.0, 1040.0, 1075.0] {
+        let off_m = scene.ground_height_m(x_m, 55.0) - (160.0 + 0.05 * (x_m - 1000.0));
+        assert!(off_m.abs() < 1e-9, "{off_m} at {x_m}");
+    }
 }
 
 #[test]

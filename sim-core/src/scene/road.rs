@@ -3,7 +3,7 @@
 use super::{
     SceneError,
     grid::Grid,
-    shape::{Bounds, Point, between, contains, distance, dot, from_to, nearest_on_segment, share_along},
+    shape::{Bounds, Point, between, contains, distance, dot, from_to, share_along},
     xml::{ElementPosition, XmlTag, attribute, for_each_tag, points},
 };
 use quick_xml::events::BytesStart;
@@ -197,21 +197,32 @@ impl RoadPiece {
         }
     }
 
-    /// Distance from `point` to this part, metres; 0 on it.
-    fn distance_to(&self, part: usize, point: Point) -> f64 {
+    /// Distance from `point` to this part, 0 on it, and height of the part at the place nearest to it, metres.
+    fn nearest(&self, part: usize, point: Point) -> (f64, f64) {
+        let nearest = |from: [f64; 3], to: [f64; 3]| {
+            let (a, b) = (flat(from), flat(to));
+            let share = share_along(a, b, point).clamp(0.0, 1.0);
+            (
+                distance(between(a, b, share), point),
+                from[2] + share * (to[2] - from[2]),
+            )
+        };
         match self.half_width_m {
             Some(half_m) => {
-                let [a, b] = [self.shape_m[part], self.shape_m[part + 1]].map(flat);
-                (distance(nearest_on_segment(a, b, point), point) - half_m).max(0.0)
+                let (distance_m, height_m) = nearest(self.shape_m[part], self.shape_m[part + 1]);
+                ((distance_m - half_m).max(0.0), height_m)
             }
             None => {
                 let outline: Vec<Point> = self.shape_m.iter().copied().map(flat).collect();
                 if contains(&outline, point) {
-                    return 0.0;
+                    return (0.0, self.mean_height(point));
                 }
-                super::shape::edges(&outline)
-                    .map(|(a, b)| distance(nearest_on_segment(a, b, point), point))
-                    .fold(f64::INFINITY, f64::min)
+                let last = self.shape_m.last().copied().into_iter();
+                let edges = last.chain(self.shape_m.iter().copied()).zip(&self.shape_m);
+                edges
+                    .map(|(from, to)| nearest(from, *to))
+                    .min_by(|a, b| a.0.total_cmp(&b.0))
+                    .unwrap_or((f64::INFINITY, 0.0))
             }
         }
     }
@@ -325,7 +336,7 @@ impl Road {
         })
     }
 
-    /// The piece nearest to `point` within `reach_m`: distance and height of its nearest corner, metres.
+    /// The piece nearest to `point` within `reach_m`: its distance, and its height at the nearest place, metres.
     #[must_use]
     pub fn nearest(&self, point: Point, reach_m: f64, wanted: impl Fn(SurfaceKind) -> bool) -> Option<(f64, f64)> {
         let mut found = Vec::new();
@@ -337,10 +348,9 @@ impl Road {
             if !wanted(piece.surface) {
                 continue;
             }
-            let distance_m = piece.distance_to(part as usize, point);
+            let (distance_m, height_m) = piece.nearest(part as usize, point);
             if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
-                let corner = piece.shape_m[part as usize];
-                nearest = Some((distance_m, corner[2]));
+                nearest = Some((distance_m, height_m));
             }
         }
         nearest
