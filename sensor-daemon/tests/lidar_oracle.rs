@@ -6,21 +6,28 @@ mod lidar_city;
 
 use ipc_schema::pointcloud::{LidarPoint, Scan};
 use lidar_city::{
-    Moves, SUB_STEPS, exact_config,
+    Moves, SUB_STEPS, exact_config, hilly,
     oracle::{ScanTotals, WorldTick, compare, rays},
     scene, traffic,
 };
 use sensor_daemon::sensors::lidar::{LidarModel, ScanScratch, Targets};
+use sim_core::scene::Scene;
 
 /// One scan of each of `carriers` against parry.
-fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Range<usize>) -> ScanTotals {
+fn tally(
+    scene: &Scene,
+    moves: Moves,
+    is_rolling: bool,
+    lean: [f64; 2],
+    carriers: std::ops::Range<usize>,
+) -> ScanTotals {
     let mut config = exact_config();
     config.lidar.rolling_shutter = is_rolling;
     config.lidar.mount = [1.0, 0.1, 2.0, lean[0], lean[1], 0.2];
-    let scene = scene(500, 1);
-    let (states, steps) = traffic(200, 60, moves, 0, 2);
-    let lidar = LidarModel::new(&config, &scene).unwrap();
-    let world = WorldTick::new(&config, &scene, &states, &steps);
+    let (mut states, steps) = traffic(200, 60, moves, 0, 2);
+    lidar_city::stand_on(scene, &mut states);
+    let lidar = LidarModel::new(&config, scene).unwrap();
+    let world = WorldTick::new(&config, scene, &states, &steps);
     let mut targets = Targets::default();
     targets.update(&states, &steps, SUB_STEPS);
     let (mut scratch, mut scan) = (ScanScratch::default(), Scan::default());
@@ -49,20 +56,36 @@ fn check(tally: &ScanTotals) {
 
 #[test]
 fn upright_and_all_at_once() {
-    check(&tally(Moves::Straight, false, [0.0; 2], 0..4));
+    check(&tally(&scene(500, 1), Moves::Straight, false, [0.0; 2], 0..4));
 }
 
 #[test]
 fn upright_with_rolling_shutter() {
-    check(&tally(Moves::Straight, true, [0.0; 2], 4..9));
+    check(&tally(&scene(500, 1), Moves::Straight, true, [0.0; 2], 4..9));
 }
 
 #[test]
 fn leaning_and_all_at_once() {
-    check(&tally(Moves::Wildly, false, [0.05, -0.08], 9..13));
+    check(&tally(&scene(500, 1), Moves::Wildly, false, [0.05, -0.08], 9..13));
 }
 
 #[test]
 fn leaning_with_rolling_shutter() {
-    check(&tally(Moves::Wildly, true, [-0.03, 0.06], 13..18));
+    check(&tally(&scene(500, 1), Moves::Wildly, true, [-0.03, 0.06], 13..18));
+}
+
+/// No scan of these is upright: the city lies on slopes of up to 13 %.
+#[test]
+fn on_hills_and_all_at_once() {
+    check(&tally(&hilly(), Moves::Wildly, false, [0.05, -0.08], 18..22));
+}
+
+#[test]
+fn on_hills_with_rolling_shutter() {
+    check(&tally(&hilly(), Moves::Wildly, true, [-0.03, 0.06], 22..26));
+}
+
+#[test]
+fn upright_on_hills() {
+    check(&tally(&hilly(), Moves::Straight, true, [0.0; 2], 26..30));
 }

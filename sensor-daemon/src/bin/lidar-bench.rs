@@ -1,9 +1,11 @@
 //! Rays per second of the LIDAR on one core, beside general ray tracers in the same run, and its agreement with parry3d.
 //!
-//! `cargo run --release -p sensor-daemon --bin lidar-bench -- [--python PATH] [--path auto|avx512|avx2|plain] [--json FILE] [--oracle]`
+//! `cargo run --release -p sensor-daemon --bin lidar-bench -- [--python PATH] [--path auto|avx512|avx2|plain] [--only CASE]
+//! [--json FILE] [--oracle]`
 //!
 //! `--python` names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs libusb-1.0, libGL and libgomp) and
-//! optionally `embreex`; without it the peers are left out. `--oracle` compares ten million rays with parry3d instead.
+//! optionally `embreex`; without it the peers are left out. `--only` measures one case, by its name. `--oracle`
+//! compares fifteen million rays with parry3d instead.
 
 #![allow(
     clippy::unwrap_used,
@@ -40,6 +42,7 @@ const TICKS: u64 = 10;
 struct Options {
     python: Option<PathBuf>,
     path: ScanPath,
+    only: Option<String>,
     json: Option<PathBuf>,
     is_oracle: bool,
 }
@@ -48,6 +51,7 @@ fn options() -> Options {
     let mut options = Options {
         python: None,
         path: ScanPath::best(),
+        only: None,
         json: None,
         is_oracle: false,
     };
@@ -56,6 +60,7 @@ fn options() -> Options {
         let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
         match argument.as_str() {
             "--python" => options.python = Some(value().into()),
+            "--only" => options.only = Some(value()),
             "--json" => options.json = Some(value().into()),
             "--path" => {
                 options.path = match value().as_str() {
@@ -81,17 +86,20 @@ fn main() {
     }
     let mut report = serde_json::json!({ "path": format!("{:?}", options.path), "cases": {}, "lidars": {} });
     let cases = [
-        ("upright", Moves::Straight, false, false),
-        ("upright, rolling shutter", Moves::Straight, true, false),
-        ("tilted", Moves::Wildly, false, true),
-        ("tilted, rolling shutter", Moves::Wildly, true, true),
+        ("upright", Moves::Straight, false, Ground::Flat),
+        ("upright, rolling shutter", Moves::Straight, true, Ground::Flat),
+        ("tilted", Moves::Wildly, false, Ground::FlatAndTilted),
+        ("tilted, rolling shutter", Moves::Wildly, true, Ground::FlatAndTilted),
+        ("hills", Moves::Wildly, false, Ground::Hills),
+        ("hills, rolling shutter", Moves::Wildly, true, Ground::Hills),
     ];
     println!(
         "{BUILDINGS} buildings, {VEHICLES} moving vehicles, {CARRIERS} LIDARs of 32 x 1800 rays, one core, {:?}",
         options.path
     );
-    for (name, moves, is_rolling, is_tilted) in cases {
-        let mut bench = Bench::new(options.path, moves, is_rolling, is_tilted, CARRIERS);
+    let wanted = |name: &str| options.only.as_deref().is_none_or(|only| only == name);
+    for (name, moves, is_rolling, ground) in cases.into_iter().filter(|case| wanted(case.0)) {
+        let mut bench = Bench::new(options.path, moves, is_rolling, ground, CARRIERS);
         bench.round();
         let mut rates: Vec<f64> = (0..PAIRS).map(|_| bench.round().rate()).collect();
         rates.sort_by(f64::total_cmp);
@@ -107,8 +115,8 @@ fn main() {
         report["cases"][name] =
             serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "spread": [rates[0], rates[PAIRS - 1]] });
     }
-    for lidars in [1, 10, 100] {
-        let mut bench = Bench::new(options.path, Moves::Wildly, true, true, lidars);
+    for lidars in [1, 10, 100].into_iter().filter(|_| options.only.is_none()) {
+        let mut bench = Bench::new(options.path, Moves::Wildly, true, Ground::FlatAndTilted, lidars);
         bench.round();
         let mut rates: Vec<f64> = (0..PAIRS).map(|_| bench.round().rate()).collect();
         rates.sort_by(f64::total_cmp);
@@ -147,6 +155,17 @@ fn cpu_s() -> f64 {
     ipc_schema::clock::seconds(rustix::time::ClockId::ThreadCPUTime)
 }
 
+/// What the city stands on, and how the LIDARs are mounted.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Ground {
+    /// A plane, and upright LIDARs.
+    Flat,
+    /// A plane, and LIDARs that lean.
+    FlatAndTilted,
+    /// Streets that rise and fall by 8 m, on slopes of up to 13 %, and LIDARs that lean.
+    Hills,
+}
+
 /// A city, its traffic tick by tick, and LIDARs in it that write into shared memory.
 struct Bench {
     config: Config,
@@ -160,18 +179,22 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(path: ScanPath, moves: Moves, is_rolling: bool, is_tilted: bool, lidars: usize) -> Self {
+    fn new(path: ScanPath, moves: Moves, is_rolling: bool, ground: Ground, lidars: usize) -> Self {
         let mut config = lidar_city::config();
         config.lidar.rolling_shutter = is_rolling;
-        if is_tilted {
+        if ground != Ground::Flat {
             config.lidar.mount[3..5].copy_from_slice(&[0.02, -0.03]);
         }
-        let scene = lidar_city::scene(BUILDINGS, 1);
+        let scene = match ground {
+            Ground::Hills => lidar_city::hilly(),
+            _ => lidar_city::scene(BUILDINGS, 1),
+        };
         let lidar = LidarModel::new(&config, &scene)
             .unwrap_or_else(|error| panic!("{error}"))
             .with_path(path);
         let ticks = (0..TICKS).map(|tick| {
             let (mut states, steps) = lidar_city::traffic(VEHICLES, 0, moves, tick, 2);
+            lidar_city::stand_on(&scene, &mut states);
             // Carriers do not see themselves, and the peers leave them out too.
             states[..CARRIERS].iter_mut().for_each(|state| state.height_m = 0.0);
             (states, steps)
@@ -339,7 +362,7 @@ impl Peers {
 fn peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
     let directory = std::env::temp_dir().join(format!("lidar-bench-{}", std::process::id()));
     std::fs::create_dir_all(&directory).unwrap();
-    let mut bench = Bench::new(path, Moves::Straight, false, false, CARRIERS);
+    let mut bench = Bench::new(path, Moves::Straight, false, Ground::Flat, CARRIERS);
     write_frame(&directory, &bench);
     let mut report = serde_json::json!({});
     let mut peers = Peers::start(python, &directory);
@@ -372,14 +395,16 @@ fn peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
     report
 }
 
-/// Compares ten million rays, upright and tilted, with and without rolling shutter, with parry3d.
+/// Compares fifteen million rays, upright, tilted and on hills, with and without rolling shutter, with parry3d.
 fn hold_against_parry(path: ScanPath) {
     let mut all = oracle::ScanTotals::default();
-    for (number, (moves, is_rolling, lean)) in [
-        (Moves::Straight, false, [0.0, 0.0]),
-        (Moves::Straight, true, [0.0, 0.0]),
-        (Moves::Wildly, false, [0.05, -0.08]),
-        (Moves::Wildly, true, [-0.03, 0.06]),
+    for (number, (moves, is_rolling, lean, is_hilly)) in [
+        (Moves::Straight, false, [0.0, 0.0], false),
+        (Moves::Straight, true, [0.0, 0.0], false),
+        (Moves::Wildly, false, [0.05, -0.08], false),
+        (Moves::Wildly, true, [-0.03, 0.06], false),
+        (Moves::Wildly, false, [0.05, -0.08], true),
+        (Moves::Wildly, true, [-0.03, 0.06], true),
     ]
     .into_iter()
     .enumerate()
@@ -387,8 +412,12 @@ fn hold_against_parry(path: ScanPath) {
         let mut config = lidar_city::exact_config();
         config.lidar.rolling_shutter = is_rolling;
         config.lidar.mount = [1.0, 0.1, 2.0, lean[0], lean[1], 0.2];
-        let scene = lidar_city::scene(BUILDINGS, 1 + number as u64);
-        let (states, steps) = lidar_city::traffic(VEHICLES, 60, moves, number as u64, 2);
+        let scene = match is_hilly {
+            true => lidar_city::hilly(),
+            false => lidar_city::scene(BUILDINGS, 1 + number as u64),
+        };
+        let (mut states, steps) = lidar_city::traffic(VEHICLES, 60, moves, number as u64, 2);
+        lidar_city::stand_on(&scene, &mut states);
         let lidar = LidarModel::new(&config, &scene).unwrap().with_path(path);
         let world = oracle::WorldTick::new(&config, &scene, &states, &steps);
         let mut targets = Targets::default();
@@ -401,7 +430,7 @@ fn hold_against_parry(path: ScanPath) {
             all.add(&oracle::compare(&world, &rays, row, &points[..count]));
         }
         println!(
-            "{moves_name}, rolling shutter {is_rolling}: {all:?}",
+            "{moves_name}, hills {is_hilly}, rolling shutter {is_rolling}: {all:?}",
             moves_name = if lean[0] == 0.0 { "upright" } else { "tilted" }
         );
     }

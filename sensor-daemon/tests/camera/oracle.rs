@@ -7,10 +7,9 @@ use parry3d_f64::{
     shape::{Cuboid, Cylinder, TriMesh},
 };
 use sensor_daemon::sensors::camera::SKY_INSTANCE;
-use sim_core::scene::{RoadPiece, SurfaceKind};
 
 use crate::{
-    CameraModel, CameraParams, CameraPose, CameraScratch, GROUND, Kind, Road, Scene, VehicleState, config, lidar_city,
+    CameraModel, CameraParams, CameraPose, CameraScratch, GROUND, Kind, Scene, VehicleState, config, lidar_city,
     lidar_city::{Moves, Random, scene, traffic},
     params, take,
 };
@@ -33,54 +32,6 @@ struct World<'a> {
     range_m: f64,
 }
 
-/// The test city on hills: streets that rise and fall by up to 8 m.
-fn hilly() -> Scene {
-    let height_m = |x: f64, y: f64| 4.0 * (x / 55.0).sin() + 4.0 * (y / 70.0).cos();
-    let streets = (0..17).flat_map(|street| [(street, false), (street, true)]);
-    let pieces = streets.map(|(street, is_north)| {
-        let across = 50.0 * (f64::from(street) - 8.0);
-        let at = |step: u32| {
-            let along = 10.0 * f64::from(step) - 420.0;
-            let [x, y] = if is_north { [across, along] } else { [along, across] };
-            [x, y, height_m(x, y)]
-        };
-        RoadPiece {
-            id: format!("street{street}{is_north}_0"),
-            surface: SurfaceKind::Lane,
-            shape_m: (0..85).map(at).collect(),
-            half_width_m: Some(4.0),
-            junctions: [0; 2],
-        }
-    });
-    Scene::new(
-        Road::new(pieces.collect()),
-        scene(500, 1).buildings().to_vec(),
-        Vec::new(),
-    )
-}
-
-/// The ground as docs/camera.md has it: cells of 5 m, 100 m beyond the outermost road, two triangles each.
-fn relief(scene: &Scene) -> TriMesh {
-    let places: Vec<_> = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m).collect();
-    let low = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(f64::INFINITY, f64::min) - 100.0);
-    let high = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(0.0, f64::max) + 100.0);
-    let [columns, rows] = [0, 1].map(|axis: usize| ((high[axis] - low[axis]) / 5.0).ceil() as u32 + 1);
-    let corners = (0..columns * rows).map(|corner| {
-        let (x, y) = (
-            low[0] + 5.0 * f64::from(corner % columns),
-            low[1] + 5.0 * f64::from(corner / columns),
-        );
-        Vector::new(x, y, scene.ground_height_m(x, y))
-    });
-    let mut faces = Vec::new();
-    for row in 0..rows - 1 {
-        for at in row * columns..(row + 1) * columns - 1 {
-            faces.extend([[at, at + 1, at + columns], [at + 1, at + columns + 1, at + columns]]);
-        }
-    }
-    TriMesh::new(corners.collect(), faces).unwrap()
-}
-
 impl<'a> World<'a> {
     fn new(scene: &Scene, states: &'a [VehicleState], range_m: f64) -> Self {
         let (vertices, faces, owner) = lidar_city::oracle::triangles(scene);
@@ -88,7 +39,7 @@ impl<'a> World<'a> {
         Self {
             buildings: TriMesh::new(vertices, faces).unwrap(),
             owner,
-            ground: (!scene.road().pieces().is_empty()).then(|| relief(scene)),
+            ground: (!scene.road().pieces().is_empty()).then(|| lidar_city::oracle::relief(scene)),
             states,
             range_m,
         }
@@ -215,9 +166,7 @@ fn compare_through(
     seed: u64,
 ) -> Agreement {
     let (mut states, _) = traffic(200, 60, moves, 0, seed);
-    for state in &mut states {
-        state.z_m = scene.ground_height_m(state.x_m, state.y_m);
-    }
+    lidar_city::stand_on(scene, &mut states);
     let mut random = Random(seed);
     let mut agreement = Agreement::default();
     let mut scratch = CameraScratch::default();
@@ -309,7 +258,7 @@ fn leaning_cameras_see_what_parry_sees() {
 
 #[test]
 fn cameras_on_hills_see_what_parry_sees() {
-    check(&compare(&hilly(), Moves::Wildly, 12..16, [160, 120], 6));
+    check(&compare(&lidar_city::hilly(), Moves::Wildly, 12..16, [160, 120], 6));
 }
 
 #[test]
@@ -331,7 +280,14 @@ fn cameras_with_a_lens_see_what_parry_sees_along_its_rays() {
         [150, 117],
         8,
     ));
-    check(&compare_through(barrel, &hilly(), Moves::Wildly, 12..14, [160, 120], 9));
+    check(&compare_through(
+        barrel,
+        &lidar_city::hilly(),
+        Moves::Wildly,
+        12..14,
+        [160, 120],
+        9,
+    ));
 }
 
 /// Ten million rays: `cargo test --release --test camera -- --ignored ten_million`.
@@ -340,5 +296,5 @@ fn cameras_with_a_lens_see_what_parry_sees_along_its_rays() {
 fn ten_million_rays() {
     check(&compare(&scene(500, 1), Moves::Straight, 0..80, [320, 160], 4));
     check(&compare(&scene(500, 1), Moves::Wildly, 80..160, [320, 160], 5));
-    check(&compare(&hilly(), Moves::Wildly, 160..200, [320, 160], 6));
+    check(&compare(&lidar_city::hilly(), Moves::Wildly, 160..200, [320, 160], 6));
 }

@@ -11,6 +11,7 @@ use sensor_daemon::sensors::lidar::{LidarModel, ScanScratch, Targets};
 use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
 mod disturbances;
+mod hills;
 #[path = "../lidar_city/mod.rs"]
 mod lidar_city;
 mod motion;

@@ -131,7 +131,7 @@ fn meshes_and_ground_with_elevation_are_seen() {
     let ground: Vec<_> = scanned.points.iter().filter(|point| range(point) < 30.0).collect();
     assert!(ground.len() > 500);
     for point in ground {
-        assert_eq!((point.object, point.tag), (GROUND, Tag::Mesh as u16));
+        assert_eq!((point.object, point.tag), (GROUND, Tag::Ground as u16));
         let [x, _, z] = point.position_m.map(f64::from);
         assert!((z - 0.1 * x + 2.0).abs() < 0.02, "{x} {z}");
     }

@@ -12,7 +12,7 @@ use ipc_schema::{
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
-use sim_core::scene::{Prism, Scene, SolidClass};
+use sim_core::scene::{Prism, Road, RoadPiece, Scene, SolidClass, SurfaceKind};
 
 pub mod oracle;
 
@@ -114,6 +114,48 @@ pub fn scene(buildings: usize, seed: u64) -> Scene {
         Prism::new(id, SolidClass::Building, outline.collect(), 0.0, height).unwrap()
     });
     Scene::new(Default::default(), prisms.collect(), Vec::new())
+}
+
+/// The test city on hills: streets that rise and fall by up to 8 m, and buildings whose lowest corner is on the ground.
+pub fn hilly() -> Scene {
+    let height_m = |x: f64, y: f64| 4.0 * (x / 55.0).sin() + 4.0 * (y / 70.0).cos();
+    let streets = (0..17).flat_map(|street| [(street, false), (street, true)]);
+    let pieces = streets.map(|(street, is_north)| {
+        let across = 50.0 * (f64::from(street) - 8.0);
+        let at = |step: u32| {
+            let along = 10.0 * f64::from(step) - 420.0;
+            let [x, y] = if is_north { [across, along] } else { [along, across] };
+            [x, y, height_m(x, y)]
+        };
+        RoadPiece {
+            id: format!("street{street}{is_north}_0"),
+            surface: SurfaceKind::Lane,
+            shape_m: (0..85).map(at).collect(),
+            half_width_m: Some(4.0),
+            junctions: [0; 2],
+        }
+    });
+    let bare = Scene::new(Road::new(pieces.collect()), Vec::new(), Vec::new());
+    let buildings = scene(500, 1).buildings().to_vec().into_iter().map(|building| {
+        let heights_m = building.outline_m.iter().map(|[x, y]| bare.ground_height_m(*x, *y));
+        let base_m = heights_m.fold(f64::INFINITY, f64::min);
+        Prism::new(
+            building.id,
+            building.class,
+            building.outline_m,
+            base_m,
+            building.height_m,
+        )
+        .unwrap()
+    });
+    Scene::new(bare.road().clone(), buildings.collect(), Vec::new())
+}
+
+/// Puts road users onto the ground.
+pub fn stand_on(scene: &Scene, states: &mut [VehicleState]) {
+    for state in states {
+        state.z_m = scene.ground_height_m(state.x_m, state.y_m);
+    }
 }
 
 /// Vehicles and persons in the streets at the end of tick `tick`, with their sub-steps.

@@ -144,9 +144,12 @@ pub fn rays(config: &Config, state: &VehicleState, steps: &[SubStep]) -> Vec<One
 
 /// The world of a tick.
 pub struct WorldTick<'a> {
-    buildings: TriMesh,
+    /// `None` without buildings.
+    buildings: Option<TriMesh>,
     /// Building of each triangle.
     owner: Vec<u32>,
+    /// Ground that is not flat.
+    ground: Option<TriMesh>,
     states: &'a [VehicleState],
     steps: &'a [SubStep],
     is_rolling: bool,
@@ -173,6 +176,30 @@ pub fn triangles(scene: &Scene) -> (Vec<[f64; 3]>, Vec<[u32; 3]>, Vec<u32>) {
         owner.resize(faces.len(), number);
     }
     (vertices, faces, owner)
+}
+
+/// The ground as docs/lidar.md has it: cells of 5 m, larger where there would be more than 250 000, 100 m beyond the outermost road, two triangles each.
+pub fn relief(scene: &Scene) -> TriMesh {
+    let places: Vec<_> = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m).collect();
+    let low = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(f64::INFINITY, f64::min) - 100.0);
+    let high = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(0.0, f64::max) + 100.0);
+    let size = [0, 1].map(|axis: usize| high[axis] - low[axis]);
+    let cell_m = (size[0] * size[1] / 250_000.0).sqrt().max(5.0);
+    let [columns, rows] = size.map(|length_m| (length_m / cell_m).ceil() as u32 + 1);
+    let corners = (0..columns * rows).map(|corner| {
+        let (x, y) = (
+            low[0] + cell_m * f64::from(corner % columns),
+            low[1] + cell_m * f64::from(corner / columns),
+        );
+        Vector::new(x, y, scene.ground_height_m(x, y))
+    });
+    let mut faces = Vec::new();
+    for row in 0..rows - 1 {
+        for at in row * columns..(row + 1) * columns - 1 {
+            faces.extend([[at, at + 1, at + columns], [at + 1, at + columns + 1, at + columns]]);
+        }
+    }
+    TriMesh::new(corners.collect(), faces).unwrap()
 }
 
 /// A simple polygon, counter-clockwise, as triangles.
@@ -203,8 +230,9 @@ impl<'a> WorldTick<'a> {
         let (vertices, faces, owner) = triangles(scene);
         let vertices = vertices.iter().map(|[x, y, z]| Vector::new(*x, *y, *z)).collect();
         Self {
-            buildings: TriMesh::new(vertices, faces).unwrap(),
+            buildings: TriMesh::new(vertices, faces).ok(),
             owner,
+            ground: (!scene.road().pieces().is_empty()).then(|| relief(scene)),
             states,
             steps,
             is_rolling: config.lidar.rolling_shutter,
@@ -223,12 +251,17 @@ impl<'a> WorldTick<'a> {
                 hit = Hit { range_m, object };
             }
         };
-        if ray.direction[2] < 0.0 {
-            offer(-ray.origin_m[2] / ray.direction[2], GROUND);
-        }
         let vector = |[x, y, z]: [f64; 3]| Vector::new(x, y, z);
         let cast = Ray::new(vector(ray.origin_m), vector(ray.direction));
-        if let Some(met) = self.buildings.cast_local_ray_and_get_normal(&cast, self.range_m, false) {
+        if let Some(ground) = &self.ground {
+            if let Some(range_m) = ground.cast_local_ray(&cast, self.range_m, false) {
+                offer(range_m, GROUND);
+            }
+        } else if ray.direction[2] < 0.0 {
+            offer(-ray.origin_m[2] / ray.direction[2], GROUND);
+        }
+        let met = self.buildings.as_ref();
+        if let Some(met) = met.and_then(|met| met.cast_local_ray_and_get_normal(&cast, self.range_m, false)) {
             let face = met.subshape as usize % self.owner.len();
             offer(met.time_of_impact, STATIC_OBJECT | self.owner[face]);
         }

@@ -3,11 +3,24 @@
 use ipc_schema::pointcloud::{GROUND, Tag};
 
 use super::{
-    raster::{ColumnChunk, ScanCanvas},
+    raster::{CHUNKS, ColumnChunk, LinearValue, ScanCanvas, SurfaceBody},
     scan::SpanScan,
     sensor::{Rotation, turned},
     simd::{Floats, Simd, WIDTH},
     solids::NOTHING,
+    terrain::{GroundProfile, Terrain, TerrainView},
+};
+
+/// How far the ground is drawn before all surfaces, metres: the lower lasers end there, and far surfaces are only looked at for rays
+/// that may reach them.
+const NEAR_M: f32 = 40.0;
+/// The ground as a body: its bounds are not used.
+const GROUND_BODY: SurfaceBody = SurfaceBody {
+    object: GROUND,
+    word: Tag::Ground as u32,
+    z: [LinearValue(0.0, 0.0); 2],
+    near: 0.0,
+    chunks: [0; 2],
 };
 
 /// Vectors of length 1 from vectors of nearly that, by a step of Newton's.
@@ -28,7 +41,7 @@ impl SpanScan<'_> {
         turned(&back, self.order.lidar.receiver.air.sun).map(|part| part as f32)
     }
 
-    /// Directions of the columns and their rays, ages, and the ground.
+    /// Directions of the columns and their rays, ages, and flat ground.
     #[inline(always)]
     pub(super) fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut ScanCanvas) {
         canvas.count = self.span.count;
@@ -45,6 +58,70 @@ impl SpanScan<'_> {
         for column in 0..self.span.count {
             self.aim::<S>(canvas, column);
             self.ground_tilted::<S>(canvas, column);
+        }
+    }
+
+    /// The ground of a net with elevation that is near, before any surface: what it hides is not drawn.
+    #[inline(always)]
+    pub(super) fn near_relief<S: Simd>(
+        &self,
+        canvas: &mut ScanCanvas,
+        (terrain, view): (&Terrain, &TerrainView),
+        profile: &mut GroundProfile,
+    ) {
+        terrain.enter::<S>(view, canvas, profile);
+        let reach = NEAR_M.min(self.order.lidar.range_m as f32);
+        terrain.follow::<S>(view, canvas, [reach; CHUNKS], profile);
+        self.draw_relief::<S>(canvas, (terrain, view), profile);
+    }
+
+    /// The rest of the ground, after all surfaces: no farther than any ray still reaches.
+    #[inline(always)]
+    pub(super) fn far_relief<S: Simd>(
+        &self,
+        canvas: &mut ScanCanvas,
+        (terrain, view): (&Terrain, &TerrainView),
+        profile: &mut GroundProfile,
+    ) {
+        let mut reach = [0.0; CHUNKS];
+        for (chunk, reach) in reach.iter_mut().enumerate().take(canvas.chunks()) {
+            let far = S::load(&canvas.columns[chunk].far);
+            *reach = S::largest(S::select(S::mask(canvas.live(chunk)), far, S::splat(0.0)));
+        }
+        terrain.follow::<S>(view, canvas, reach, profile);
+        self.draw_relief::<S>(canvas, (terrain, view), profile);
+    }
+
+    /// Draws the new segments of the profiles.
+    #[inline(always)]
+    fn draw_relief<S: Simd>(
+        &self,
+        canvas: &mut ScanCanvas,
+        (terrain, view): (&Terrain, &TerrainView),
+        profile: &GroundProfile,
+    ) {
+        let zero = S::splat(0.0);
+        for column in 0..canvas.count {
+            let at @ (chunk, element) = (column / WIDTH, column % WIDTH);
+            if !profile.is_new(chunk) {
+                continue;
+            }
+            let share = canvas.columns[chunk].share.0[element];
+            let mut next = profile.first(chunk);
+            for (group, rays) in self.order.lidar.pattern.groups.iter().enumerate() {
+                let place = column * canvas.groups + group;
+                let Some(met) = profile.meet::<S>(at, &mut next, S::load(&rays.tan), rays.live) else {
+                    continue;
+                };
+                let [x, y, z] = canvas.ray::<S>(place);
+                let facing = z - met.slope[0] * x - met.slope[1] * y;
+                let t = met.height / facing;
+                let best = S::load(&canvas.t[place]);
+                let seen = S::both(S::lt(facing, zero), S::both(S::lt(zero, t), S::lt(t, best)));
+                let is_hit = S::both(seen, terrain.holds::<S>(view, share, [t * x, t * y]));
+                let length = S::sqrt(S::splat(1.0) + met.slope[0] * met.slope[0] + met.slope[1] * met.slope[1]);
+                canvas.put::<S>(place, is_hit, (t, best), facing / length, &GROUND_BODY);
+            }
         }
     }
 
@@ -178,6 +255,10 @@ impl SpanScan<'_> {
         for group in 0..canvas.groups {
             let place = column * canvas.groups + group;
             let z = S::load(&canvas.direction[2][place]);
+            if self.order.lidar.ground_m.is_none() {
+                self.lay::<S>(canvas, place, 0.0, (limit, limit), z);
+                continue;
+            }
             self.lay::<S>(canvas, place, height, (S::splat(-height) / z, limit), z);
         }
     }

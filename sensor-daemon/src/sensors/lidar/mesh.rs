@@ -26,6 +26,15 @@ struct Mesh {
     object: u32,
 }
 
+impl Mesh {
+    fn word(&self) -> u32 {
+        match self.object {
+            GROUND => Tag::Ground as u32,
+            _ => Tag::Mesh as u32,
+        }
+    }
+}
+
 impl std::fmt::Debug for Mesh {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter
@@ -37,7 +46,10 @@ impl std::fmt::Debug for Mesh {
 
 /// All meshes of a scene.
 #[derive(Debug, Default)]
-pub(super) struct SceneMeshes(Vec<Mesh>);
+pub(super) struct SceneMeshes {
+    ground: Option<Mesh>,
+    placed: Vec<Mesh>,
+}
 
 /// Hit of a ray on a mesh.
 #[derive(Debug, Clone, Copy)]
@@ -45,41 +57,54 @@ pub(super) struct MeshHit {
     pub(super) range_m: f64,
     pub(super) incidence_cos: f64,
     pub(super) object: u32,
+    /// Tag.
+    pub(super) word: u32,
 }
 
 impl SceneMeshes {
-    /// Tag of all meshes.
-    pub(super) const WORD: u32 = Tag::Mesh as u32;
-
-    pub(super) fn new(placements: &[MeshPlacement], scene: &Scene) -> Result<Self, LidarError> {
-        let mut meshes = Vec::new();
-        meshes.extend(GroundGrid::new(scene).as_ref().and_then(GroundGrid::mesh));
+    pub(super) fn new(
+        placements: &[MeshPlacement],
+        scene: &Scene,
+        ground: Option<&GroundGrid>,
+    ) -> Result<Self, LidarError> {
+        let mut placed = Vec::new();
         let first = (scene.buildings().len() + scene.props().len()) as u32;
         for (number, placement) in (first..).zip(placements) {
-            meshes.push(Mesh {
+            placed.push(Mesh {
                 triangles: read(placement, scene)?,
                 object: STATIC_OBJECT | number,
             });
         }
-        Ok(Self(meshes))
+        Ok(Self {
+            ground: ground.and_then(GroundGrid::mesh),
+            placed,
+        })
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        self.0.is_empty()
+    /// Neither meshes nor, with `with_ground`, the ground.
+    pub(super) fn is_empty(&self, with_ground: bool) -> bool {
+        self.placed.is_empty() && (self.ground.is_none() || !with_ground)
     }
 
-    /// The nearest hit of a ray within `range_m`; `direction` has length 1.
-    pub(super) fn cast(&self, origin_m: [f64; 3], direction: [f64; 3], range_m: f64) -> Option<MeshHit> {
+    /// The nearest hit of a ray within `range_m`, on the ground too if `with_ground`; `direction` has length 1.
+    pub(super) fn cast(
+        &self,
+        origin_m: [f64; 3],
+        direction: [f64; 3],
+        range_m: f64,
+        with_ground: bool,
+    ) -> Option<MeshHit> {
         let vector = |[x, y, z]: [f64; 3]| Vector::new(x, y, z);
         let ray = Ray::new(vector(origin_m), vector(direction));
         let mut nearest: Option<MeshHit> = None;
-        for mesh in &self.0 {
+        for mesh in self.ground.iter().filter(|_| with_ground).chain(&self.placed) {
             let most_m = nearest.map_or(range_m, |hit| hit.range_m);
             if let Some(hit) = mesh.triangles.cast_local_ray_and_get_normal(&ray, most_m, false) {
                 nearest = Some(MeshHit {
                     range_m: hit.time_of_impact,
                     incidence_cos: hit.normal.dot(ray.dir).abs(),
                     object: mesh.object,
+                    word: mesh.word(),
                 });
             }
         }
@@ -124,6 +149,11 @@ impl GroundGrid {
         let places = (0..columns * rows).map(|corner| grid.place(corner % columns, corner / columns));
         grid.heights_m = places.map(|[x, y]| scene.ground_height_m(x, y)).collect();
         Some(grid)
+    }
+
+    /// Heights of all corners, row by row, metres.
+    pub(in crate::sensors) fn heights_m(&self) -> &[f64] {
+        &self.heights_m
     }
 
     fn place(&self, column: usize, row: usize) -> [f64; 2] {

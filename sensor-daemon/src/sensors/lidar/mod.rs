@@ -25,6 +25,7 @@ pub(super) mod sensor;
 pub(super) mod simd;
 pub(super) mod solids;
 pub(super) mod targets;
+mod terrain;
 mod weather;
 
 pub use error::LidarError;
@@ -82,6 +83,8 @@ pub struct LidarModel {
     mount: sensor::SensorMount,
     solids: solids::StillSolids,
     meshes: mesh::SceneMeshes,
+    /// The ground of a net with elevation, unless the pattern is a table.
+    terrain: Option<terrain::Terrain>,
     receiver: returns::ReturnModel,
     path: ScanPath,
     /// Height of flat ground; `None` if the ground is a mesh.
@@ -106,11 +109,13 @@ impl LidarModel {
         let pattern = pattern::RayPattern::new(lidar)?;
         let firing = firing::FiringSequence::new(config, &pattern)?;
         let mount = sensor::SensorMount::new(lidar.mount);
-        let meshes = mesh::SceneMeshes::new(&config.scene.meshes, scene)?;
+        let ground = GroundGrid::new(scene);
+        let meshes = mesh::SceneMeshes::new(&config.scene.meshes, scene, ground.as_ref())?;
         let tangents = pattern.groups.iter().flat_map(|group| group.tan.0);
         let steepest = tangents.fold(0.0_f64, |most, tan| most.max(f64::from(tan.abs())));
         Ok(Self {
-            is_flat_fan: !pattern.is_table && mount.is_upright && meshes.is_empty(),
+            is_flat_fan: !pattern.is_table && mount.is_upright && meshes.is_empty(true),
+            terrain: ground.filter(|_| !pattern.is_table).and_then(terrain::Terrain::new),
             steepest: if pattern.is_table { f64::INFINITY } else { steepest },
             solids: solids::StillSolids::new(lidar, scene),
             receiver: returns::ReturnModel::new(config),

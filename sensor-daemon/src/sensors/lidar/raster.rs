@@ -25,7 +25,7 @@ impl LinearValue {
     }
 
     #[inline(always)]
-    fn at<S: Simd>(self, share: S::F) -> S::F {
+    pub(super) fn at<S: Simd>(self, share: S::F) -> S::F {
         S::splat(self.0) + share * S::splat(self.1)
     }
 }
@@ -38,7 +38,7 @@ fn at2<S: Simd>(lines: &[LinearValue; 2], share: S::F) -> [S::F; 2] {
 }
 
 #[inline(always)]
-fn splat2<S: Simd>(values: [f32; 2]) -> [S::F; 2] {
+pub(super) fn splat2<S: Simd>(values: [f32; 2]) -> [S::F; 2] {
     [S::splat(values[0]), S::splat(values[1])]
 }
 
@@ -166,7 +166,7 @@ fn stored2<S: Simd>(value: [S::F; 2]) -> [Floats; 2] {
 
 /// Numbers of the bits that are set.
 #[inline(always)]
-fn set(mut bits: u32) -> impl Iterator<Item = usize> {
+pub(super) fn set(mut bits: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let element = bits.trailing_zeros() as usize;
         let is_any = bits != 0;
@@ -195,14 +195,20 @@ impl ScanCanvas {
 
     /// Directions of the rays of a place.
     #[inline(always)]
-    fn ray<S: Simd>(&self, place: usize) -> [S::F; 3] {
+    pub(super) fn ray<S: Simd>(&self, place: usize) -> [S::F; 3] {
         let [x, y, z] = &self.direction;
         [S::load(&x[place]), S::load(&y[place]), S::load(&z[place])]
     }
 
+    /// Chunks of the span.
+    #[inline(always)]
+    pub(super) fn chunks(&self) -> usize {
+        self.count.div_ceil(WIDTH)
+    }
+
     /// Columns of a chunk that exist.
     #[inline(always)]
-    fn live(&self, chunk: usize) -> u32 {
+    pub(super) fn live(&self, chunk: usize) -> u32 {
         let count = self.count.saturating_sub(chunk * WIDTH).min(WIDTH);
         ((1_u64 << count) - 1) as u32
     }
@@ -210,7 +216,7 @@ impl ScanCanvas {
     /// Sets the rays of `mask` in a place, which reached `best` so far, to a hit on `body`, and returns how far they reach. The distance
     /// is stored without a mask: the next surface loads it, and a processor does not forward a masked store to a load.
     #[inline(always)]
-    fn put<S: Simd>(
+    pub(super) fn put<S: Simd>(
         &mut self,
         place: usize,
         mask: S::M,

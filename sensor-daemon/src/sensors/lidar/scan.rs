@@ -9,12 +9,12 @@ use super::{
     LidarModel, Targets,
     candidates::{CandidateKind, Candidates, SensorSweep, SpanCandidate},
     firing::{ColumnSpan, SPAN},
-    mesh::SceneMeshes,
     pattern::RayGroup,
     random::ScanKey,
     raster::{LinearValue, ScanCanvas, SpanWall, SurfaceBody},
     sensor::SensorPose,
     simd::{Simd, WIDTH},
+    terrain::GroundProfile,
 };
 
 /// Working memory of one thread: empty at first, then kept.
@@ -25,6 +25,7 @@ pub struct ScanScratch {
     spans: Vec<ColumnSpan>,
     sensors: Vec<[SensorPose; 2]>,
     walls: Vec<SpanWall>,
+    profile: GroundProfile,
 }
 
 /// Input of a scan.
@@ -160,6 +161,7 @@ impl ScanOrder<'_> {
             spans,
             sensors,
             walls,
+            profile,
         } = scratch;
         canvas.make_room(lidar.pattern.per_column);
         canvas.tan.clear();
@@ -177,10 +179,18 @@ impl ScanOrder<'_> {
                 begin,
                 dt_s: self.dt_s(),
             };
+            let terrain = lidar.terrain.as_ref();
+            let terrain = terrain.and_then(|terrain| Some((terrain, terrain.view(&work.sensors)?)));
             work.start::<S, UPRIGHT>(canvas);
+            if !UPRIGHT && let Some((terrain, view)) = &terrain {
+                work.near_relief::<S>(canvas, (terrain, view), profile);
+            }
             work.surfaces::<S, UPRIGHT>(canvas, candidates, candidates.of_span(number), walls);
-            if !UPRIGHT && !lidar.meshes.is_empty() {
-                work.meshes(canvas);
+            if !UPRIGHT && let Some((terrain, view)) = &terrain {
+                work.far_relief::<S>(canvas, (terrain, view), profile);
+            }
+            if !UPRIGHT && !lidar.meshes.is_empty(terrain.is_none()) {
+                work.meshes(canvas, terrain.is_none());
             }
             let first = (span.fired_before * lidar.pattern.per_column) as u32;
             let groups = |column: usize| work.groups(column);
@@ -342,9 +352,9 @@ impl<'a> SpanScan<'a> {
         self.caps::<S, UPRIGHT>(canvas, walls, &body);
     }
 
-    /// Rays one by one against meshes.
+    /// Rays one by one against meshes, and against the ground if `with_ground`.
     #[inline(never)]
-    fn meshes(&self, canvas: &mut ScanCanvas) {
+    fn meshes(&self, canvas: &mut ScanCanvas, with_ground: bool) {
         let lidar = self.order.lidar;
         let [from, to] = self.sensors.map(|sensor| sensor.position_m);
         for column in 0..canvas.count {
@@ -355,11 +365,11 @@ impl<'a> SpanScan<'a> {
                 for element in (0..WIDTH).filter(|element| live >> element & 1 == 1) {
                     let direction = [0, 1, 2].map(|axis: usize| f64::from(canvas.direction[axis][place].0[element]));
                     let range_m = f64::from(canvas.t[place].0[element]);
-                    if let Some(hit) = lidar.meshes.cast(origin_m, direction, range_m) {
+                    if let Some(hit) = lidar.meshes.cast(origin_m, direction, range_m, with_ground) {
                         canvas.t[place].0[element] = hit.range_m as f32;
                         canvas.incidence[place].0[element] = hit.incidence_cos as f32;
                         canvas.object[place].0[element] = hit.object;
-                        canvas.word[place].0[element] = SceneMeshes::WORD;
+                        canvas.word[place].0[element] = hit.word;
                     }
                 }
             }

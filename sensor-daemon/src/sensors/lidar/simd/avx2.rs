@@ -261,6 +261,15 @@ impl Simd for Avx2 {
         Avx2Floats(two(value.0, |a| unsafe { _mm256_castsi256_ps(a) }))
     }
     #[inline(always)]
+    fn gather(from: &[f32], at: Avx2Words) -> Avx2Floats {
+        assert!(!from.is_empty() && i32::try_from(from.len()).is_ok());
+        // SAFETY: AVX2 is available (see above); every place is within the slice, and fits into 31 bits.
+        Avx2Floats(two(at.0, |at| unsafe {
+            let last = _mm256_set1_epi32((from.len() - 1) as i32);
+            _mm256_i32gather_ps::<4>(from.as_ptr(), _mm256_min_epu32(at, last))
+        }))
+    }
+    #[inline(always)]
     fn from_signed(value: Avx2Words) -> Avx2Floats {
         // SAFETY: AVX2 is available (see above).
         Avx2Floats(two(value.0, |a| unsafe { _mm256_cvtepi32_ps(a) }))

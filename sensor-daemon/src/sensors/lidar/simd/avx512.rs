@@ -198,6 +198,15 @@ impl Simd for Avx512 {
         Avx512Floats(unsafe { _mm512_castsi512_ps(value.0) })
     }
     #[inline(always)]
+    fn gather(from: &[f32], at: Avx512Words) -> Avx512Floats {
+        assert!(!from.is_empty() && i32::try_from(from.len()).is_ok());
+        // SAFETY: AVX-512 is available (see above); every place is within the slice, and fits into 31 bits.
+        Avx512Floats(unsafe {
+            let last = _mm512_set1_epi32((from.len() - 1) as i32);
+            _mm512_i32gather_ps::<4>(_mm512_min_epu32(at.0, last), from.as_ptr())
+        })
+    }
+    #[inline(always)]
     fn from_signed(value: Avx512Words) -> Avx512Floats {
         // SAFETY: AVX-512 is available (see above).
         Avx512Floats(unsafe { _mm512_cvtepi32_ps(value.0) })

@@ -86,6 +86,8 @@ pub(in crate::sensors) trait Simd: Copy {
     fn words(value: Self::F) -> Self::U;
     /// The float of these bits.
     fn floats(value: Self::U) -> Self::F;
+    /// The numbers at these places; a place beyond the end is the last one. `from` is not empty.
+    fn gather(from: &[f32], at: Self::U) -> Self::F;
     /// Signed whole numbers as floats.
     fn from_signed(value: Self::U) -> Self::F;
     /// Philox4x32-10 of counters `[first + element, rest…]`.

@@ -30,7 +30,7 @@ operator!(Mul, mul, *);
 operator!(Div, div, /);
 
 #[inline(always)]
-fn gather(test: impl Fn(usize) -> bool) -> u32 {
+fn bits_of(test: impl Fn(usize) -> bool) -> u32 {
     (0..WIDTH).fold(0, |bits, i| bits | u32::from(test(i)) << i)
 }
 
@@ -65,11 +65,11 @@ impl Simd for Plain {
     }
     #[inline(always)]
     fn lt(a: PlainFloats, b: PlainFloats) -> u32 {
-        gather(|i| a.0[i] < b.0[i])
+        bits_of(|i| a.0[i] < b.0[i])
     }
     #[inline(always)]
     fn le(a: PlainFloats, b: PlainFloats) -> u32 {
-        gather(|i| a.0[i] <= b.0[i])
+        bits_of(|i| a.0[i] <= b.0[i])
     }
     #[inline(always)]
     fn both(a: u32, b: u32) -> u32 {
@@ -150,7 +150,7 @@ impl Simd for Plain {
     }
     #[inline(always)]
     fn equal(a: [u32; WIDTH], b: [u32; WIDTH]) -> u32 {
-        gather(|i| a[i] == b[i])
+        bits_of(|i| a[i] == b[i])
     }
     #[inline(always)]
     fn words(value: PlainFloats) -> [u32; WIDTH] {
@@ -159,6 +159,11 @@ impl Simd for Plain {
     #[inline(always)]
     fn floats(value: [u32; WIDTH]) -> PlainFloats {
         PlainFloats(value.map(f32::from_bits))
+    }
+    #[inline(always)]
+    fn gather(from: &[f32], at: [u32; WIDTH]) -> PlainFloats {
+        let last = from.len() - 1;
+        PlainFloats(at.map(|place| from[(place as usize).min(last)]))
     }
     #[inline(always)]
     fn from_signed(value: [u32; WIDTH]) -> PlainFloats {
