@@ -20,7 +20,7 @@ from setuptools import Distribution, setup
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent.parent
-NOT_IN_THE_WHEEL = ("caraware-bench", "fanout-watch", "ipc-bench", "lidar-bench", "v2x-bench")
+NOT_IN_THE_WHEEL = ("caraware-bench", "fanout-watch", "ipc-bench", "lidar-bench", "sights-bench", "v2x-bench")
 """Measurements of a checkout, where their Python side and their peers are."""
 SUMO_BESIDE = b"$ORIGIN/../../sumo/lib64"
 """Where a program finds SUMO's library from its place in the wheel; `traffic-bridge/build.rs` links it so."""

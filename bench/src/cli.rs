@@ -9,6 +9,10 @@ use clap::{Parser, ValueEnum};
 pub enum BenchPart {
     /// LIDAR: rays per second on one core, compared with Open3D's ray caster (Embree) on the same scene and rays
     Lidar,
+    /// Cameras: images per second on one core, compared with Open3D's ray caster and MuJoCo's software renderer on the same boxes
+    Camera,
+    /// Radars: scans per second on one core
+    Radar,
     /// Environments: vehicle-steps per second of 1, 2 and 4 environments, compared with one on a single core
     Envs,
     /// Fan-out: lateness and rate of a run with eight viewers (one stopped, one slow), compared with the run alone; kills of the fan-out

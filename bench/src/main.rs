@@ -18,6 +18,7 @@ mod record;
 mod report;
 mod scale;
 mod sides;
+mod sights;
 mod soak;
 mod stages;
 mod target;
@@ -128,6 +129,8 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
         BenchPart::Envs => envs::measure(options),
         BenchPart::Ipc => ipc::measure(options),
         BenchPart::Lidar => lidar::measure(options),
+        BenchPart::Camera => sights::camera(options),
+        BenchPart::Radar => sights::radar(options),
         BenchPart::Fanout => fanout::measure(options),
         BenchPart::Trainer => trainer::measure(options),
         BenchPart::Overhead => overhead::measure(options),

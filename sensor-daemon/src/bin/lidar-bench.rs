@@ -13,11 +13,7 @@
     reason = "a benchmark that cannot run panics with the reason"
 )]
 
-use std::{
-    io::{BufRead as _, BufReader, Write as _},
-    path::{Path as FilePath, PathBuf},
-    process::{Child, Command, Stdio},
-};
+use std::path::{Path as FilePath, PathBuf};
 
 use ipc_schema::{
     config::Config,
@@ -30,6 +26,9 @@ use sim_core::scene::Scene;
 #[path = "../../tests/lidar_city/mod.rs"]
 mod lidar_city;
 use lidar_city::{Moves, SUB_STEPS, oracle};
+#[path = "../../benches/peers/mod.rs"]
+mod peers;
+use peers::{Peers, Scratch, box_of, write_raw};
 
 const CARRIERS: usize = 16;
 const BUILDINGS: usize = 500;
@@ -127,7 +126,7 @@ fn main() {
         report["lidars"][lidars.to_string()] = rates[PAIRS / 2].into();
     }
     if let Some(python) = &options.python {
-        report["peers"] = peers(python, options.path);
+        report["peers"] = beside_peers(python, options.path);
     } else {
         println!("peers left out: --python PATH names an interpreter with open3d (pip install open3d-cpu)");
     }
@@ -280,7 +279,7 @@ fn write_frame(directory: &FilePath, bench: &Bench) {
     let (states, _) = bench.ticks.last().unwrap();
     let (mut vertices, mut faces, _) = oracle::triangles(&bench.scene);
     for state in &states[CARRIERS..] {
-        box_of(state, &mut vertices, &mut faces);
+        box_of(state, [0.0, 1.0, 0.0, 1.0], &mut vertices, &mut faces);
     }
     let far = 2000.0;
     let first = vertices.len() as u32;
@@ -293,86 +292,25 @@ fn write_frame(directory: &FilePath, bench: &Bench) {
             rays.extend(ray.origin_m.iter().chain(&ray.direction).map(|part| *part as f32));
         }
     }
-    let write = |name: &str, bytes: &[u8]| std::fs::write(directory.join(name), bytes).unwrap();
-    write("vertices.f32", bytemuck::cast_slice(&vertices));
-    write("faces.u32", bytemuck::cast_slice(&faces));
-    write("rays.f32", bytemuck::cast_slice(&rays));
+    write_raw(directory, "vertices.f32", &vertices);
+    write_raw(directory, "faces.u32", &faces);
+    write_raw(directory, "rays.f32", &rays);
 }
 
-fn box_of(state: &VehicleState, vertices: &mut Vec<[f64; 3]>, faces: &mut Vec<[u32; 3]>) {
-    let first = vertices.len() as u32;
-    let (sin, cos) = state.yaw_rad.sin_cos();
-    let [length, width, height, rear] =
-        [state.length_m, state.width_m, state.height_m, state.rear_overhang_m].map(f64::from);
-    for z in [0.0, height] {
-        for [a, b] in [[length - rear, 0.5], [-rear, 0.5], [-rear, -0.5], [length - rear, -0.5]] {
-            let left = b * width;
-            vertices.push([state.x_m + a * cos - left * sin, state.y_m + a * sin + left * cos, z]);
-        }
-    }
-    for i in 0..4 {
-        let (a, b) = (first + i, first + (i + 1) % 4);
-        faces.extend([[a, b, b + 4], [a, b + 4, a + 4]]);
-    }
-    faces.extend([[4, 5, 6], [4, 6, 7], [0, 2, 1], [0, 3, 2]].map(|face| face.map(|corner| first + corner)));
-}
-
-/// The process of the peers: for each line with a peer's name it answers a line with seconds, rays and hits.
-struct Peers {
-    process: Child,
-    answers: BufReader<std::process::ChildStdout>,
-    names: Vec<String>,
-}
-
-impl Peers {
-    fn start(python: &FilePath, directory: &FilePath) -> Self {
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/lidar_peers.py");
-        let mut process = Command::new(python)
-            .arg(script)
-            .arg(directory)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap_or_else(|error| panic!("{}: {error}", python.display()));
-        let answers = BufReader::new(process.stdout.take().unwrap());
-        let mut peers = Self {
-            process,
-            answers,
-            names: Vec::new(),
-        };
-        peers.names = peers.answer().split_whitespace().map(str::to_owned).collect();
-        peers
-    }
-
-    fn answer(&mut self) -> String {
-        let mut line = String::new();
-        self.answers.read_line(&mut line).unwrap();
-        line
-    }
-
-    /// Rays per second, share of hits and mean range of one round.
-    fn round(&mut self, name: &str) -> [f64; 3] {
-        writeln!(self.process.stdin.as_mut().unwrap(), "{name}").unwrap();
-        let answer = self.answer();
-        let numbers: Vec<f64> = answer.split_whitespace().map(|word| word.parse().unwrap()).collect();
-        [numbers[0], numbers[1], numbers[2]]
-    }
-}
-
-fn peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
-    let directory = std::env::temp_dir().join(format!("lidar-bench-{}", std::process::id()));
-    std::fs::create_dir_all(&directory).unwrap();
+fn beside_peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
+    let directory = Scratch::new("lidar-bench");
     let mut bench = Bench::new(path, Moves::Straight, false, Ground::Flat, CARRIERS);
-    write_frame(&directory, &bench);
+    write_frame(&directory.0, &bench);
     let mut report = serde_json::json!({});
-    let mut peers = Peers::start(python, &directory);
+    let mut peers = Peers::start(python, "lidar_peers.py", &directory.0);
     for name in peers.names.clone() {
-        let (_, warm) = (bench.round(), peers.round(&name));
+        // Rays per second, share of hits and mean range.
+        let (_, warm) = (bench.round(), peers.round::<3>(&name));
         let mut ratios = Vec::new();
         let mut rates = Vec::new();
         for _ in 0..PAIRS {
             let ours = bench.round().rate();
-            let [theirs, ..] = peers.round(&name);
+            let [theirs, ..] = peers.round::<3>(&name);
             ratios.push(ours / theirs);
             rates.push(theirs);
         }
@@ -389,9 +327,6 @@ fn peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
         );
         report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "ratio": ratios[PAIRS / 2], "spread": [ratios[0], ratios[PAIRS - 1]] });
     }
-    drop(peers.process.stdin.take());
-    let _ = peers.process.wait();
-    let _ = std::fs::remove_dir_all(&directory);
     report
 }
 

@@ -14,15 +14,6 @@ use crate::{
     params, take,
 };
 
-/// Parts of a vehicle, as shares of its length from the rear and of its height: those of docs/camera.md.
-fn parts(state: &VehicleState) -> Vec<[f64; 4]> {
-    match (state.length_m, state.height_m) {
-        (length, height) if length >= 10.0 && height < 3.7 => vec![[0.0, 1.0, 0.0, 1.0]],
-        (length, height) if length >= 6.0 || height > 2.1 => vec![[0.0, 0.78, 0.0, 1.0], [0.78, 1.0, 0.0, 0.85]],
-        _ => vec![[0.0, 1.0, 0.0, 0.55], [0.08, 0.72, 0.55, 1.0]],
-    }
-}
-
 struct World<'a> {
     buildings: TriMesh,
     owner: Vec<u32>,
@@ -95,27 +86,29 @@ fn road_user(state: &VehicleState, ray: &Ray, most_m: f64) -> Option<f64> {
         let pose = Pose::from_parts(Vector::new(x, y, z + 0.5 * height), upright);
         return Cylinder::new(0.5 * height, 0.5 * width.max(length)).cast_ray(&pose, ray, most_m, false);
     }
-    let nearest = parts(state).into_iter().filter_map(|[from, to, low, high]| {
-        let ahead = 0.5 * (from + to) * length - rear;
-        let half = [0.5 * (to - from) * length, 0.5 * width, 0.5 * (high - low) * height];
-        // A camera within a box sees through it.
-        let (dx, dy, dz) = (
-            ray.origin.x - x,
-            ray.origin.y - y,
-            ray.origin.z - z - 0.5 * (low + high) * height,
-        );
-        let (along, left) = (dx * yaw.cos() + dy * yaw.sin() - ahead, dy * yaw.cos() - dx * yaw.sin());
-        if along.abs() < half[0] && left.abs() < half[1] && dz.abs() < half[2] {
-            return None;
-        }
-        let centre = Vector::new(
-            x + ahead * yaw.cos(),
-            y + ahead * yaw.sin(),
-            z + 0.5 * (low + high) * height,
-        );
-        let pose = Pose::from_parts(centre, Rotation::from_rotation_z(yaw));
-        Cuboid::new(Vector::new(half[0], half[1], half[2])).cast_ray(&pose, ray, most_m, false)
-    });
+    let nearest = lidar_city::parts(state)
+        .into_iter()
+        .filter_map(|[from, to, low, high]| {
+            let ahead = 0.5 * (from + to) * length - rear;
+            let half = [0.5 * (to - from) * length, 0.5 * width, 0.5 * (high - low) * height];
+            // A camera within a box sees through it.
+            let (dx, dy, dz) = (
+                ray.origin.x - x,
+                ray.origin.y - y,
+                ray.origin.z - z - 0.5 * (low + high) * height,
+            );
+            let (along, left) = (dx * yaw.cos() + dy * yaw.sin() - ahead, dy * yaw.cos() - dx * yaw.sin());
+            if along.abs() < half[0] && left.abs() < half[1] && dz.abs() < half[2] {
+                return None;
+            }
+            let centre = Vector::new(
+                x + ahead * yaw.cos(),
+                y + ahead * yaw.sin(),
+                z + 0.5 * (low + high) * height,
+            );
+            let pose = Pose::from_parts(centre, Rotation::from_rotation_z(yaw));
+            Cuboid::new(Vector::new(half[0], half[1], half[2])).cast_ray(&pose, ray, most_m, false)
+        });
     nearest.min_by(f64::total_cmp)
 }
 

@@ -151,6 +151,15 @@ pub fn hilly() -> Scene {
     Scene::new(bare.road().clone(), buildings.collect(), Vec::new())
 }
 
+/// Parts of a vehicle, as shares of its length from the rear and of its height: those of docs/camera.md.
+pub fn parts(state: &VehicleState) -> Vec<[f64; 4]> {
+    match (state.length_m, state.height_m) {
+        (length, height) if length >= 10.0 && height < 3.7 => vec![[0.0, 1.0, 0.0, 1.0]],
+        (length, height) if length >= 6.0 || height > 2.1 => vec![[0.0, 0.78, 0.0, 1.0], [0.78, 1.0, 0.0, 0.85]],
+        _ => vec![[0.0, 1.0, 0.0, 0.55], [0.08, 0.72, 0.55, 1.0]],
+    }
+}
+
 /// Puts road users onto the ground.
 pub fn stand_on(scene: &Scene, states: &mut [VehicleState]) {
     for state in states {

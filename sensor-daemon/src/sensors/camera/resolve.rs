@@ -93,6 +93,9 @@ impl ImageMotions {
     }
 }
 
+/// The bits of sixteen pixels.
+const ALL: u32 = (1 << WIDTH) - 1;
+
 /// A run of pixels of one road user.
 #[derive(Clone, Copy)]
 struct UserRun {
@@ -104,6 +107,8 @@ struct UserRun {
 struct Pixels {
     depth: Floats,
     surface: Words,
+    /// All see the surface of the first.
+    is_uniform: bool,
     /// Class of the pixels on the ground.
     label: [u8; WIDTH],
     /// Share of the light that reaches the camera.
@@ -126,12 +131,16 @@ impl Resolver<'_> {
                 let count = (optics.width - first).min(WIDTH);
                 let pixels = self.sixteen::<S>(tile, row, &axes, planes);
                 let at = row * optics.width + first;
-                self.put(&pixels, at, count, planes);
+                self.put::<S>(&pixels, at, count, planes);
                 if let Some(infrared) = planes.infrared.get_mut(at..at + count) {
                     self.put_infrared::<S>(&pixels, infrared);
                 }
                 if let Some(flow_px) = planes.flow_px.get_mut(at..at + count) {
                     self.put_flow(&pixels, [tile, row], flow_px);
+                }
+                let is_same = |surface: u32| self.surfaces.surfaces[surface as usize].user == run.user;
+                if pixels.is_uniform && is_same(pixels.surface.0[0]) {
+                    continue;
                 }
                 for (element, surface) in pixels.surface.0[..count].iter().enumerate() {
                     let user = self.surfaces.surfaces[*surface as usize].user;
@@ -155,11 +164,14 @@ impl Resolver<'_> {
         let mut pixels = Pixels {
             depth: Floats::ZERO,
             surface: self.canvas.surface[place],
+            is_uniform: false,
             label: [SemanticLabel::Terrain as u8; WIDTH],
             clear: Floats::ZERO,
         };
         S::store(depth, &mut pixels.depth);
-        let ground = S::equal(S::load_words(&pixels.surface), S::splat_words(GROUND_SURFACE));
+        let surface = S::load_words(&pixels.surface);
+        pixels.is_uniform = S::bits(S::equal(surface, S::splat_words(pixels.surface.0[0]))) == ALL;
+        let ground = S::equal(surface, S::splat_words(GROUND_SURFACE));
         let needs_class = !planes.semantic.is_empty() || !planes.infrared.is_empty() || planes.have_colours();
         if needs_class && S::bits(ground) != 0 {
             self.classes::<S>(depth, tile, row, axes, S::bits(ground), &mut pixels.label);
@@ -205,24 +217,29 @@ impl Resolver<'_> {
         }
     }
 
+    /// Writes sixteen pixels, or fewer at the end of a row, into the planes of surfaces.
     #[inline(always)]
-    fn put(&self, pixels: &Pixels, at: usize, count: usize, planes: &mut ImagePlanes<'_>) {
+    fn put<S: Simd>(&self, pixels: &Pixels, at: usize, count: usize, planes: &mut ImagePlanes<'_>) {
         let table = &self.surfaces.surfaces;
+        let first = &table[pixels.surface.0[0] as usize];
         if let Some(depth) = planes.depth_m.get_mut(at..at + count) {
-            depth.copy_from_slice(&pixels.depth.0[..count]);
+            copy(&pixels.depth.0, depth);
         }
         if let Some(instance) = planes.instance.get_mut(at..at + count) {
-            for (to, surface) in instance.iter_mut().zip(&pixels.surface.0) {
-                *to = table[*surface as usize].instance;
+            if pixels.is_uniform {
+                copy(&[first.instance; WIDTH], instance);
+            } else {
+                copy(
+                    &pixels.surface.0.map(|surface| table[surface as usize].instance),
+                    instance,
+                );
             }
         }
         if let Some(semantic) = planes.semantic.get_mut(at..at + count) {
-            for (element, to) in semantic.iter_mut().enumerate() {
-                let surface = pixels.surface.0[element];
-                *to = match surface {
-                    GROUND_SURFACE => pixels.label[element],
-                    _ => table[surface as usize].label,
-                };
+            match (pixels.is_uniform, pixels.surface.0[0]) {
+                (true, GROUND_SURFACE) => copy(&pixels.label, semantic),
+                (true, _) => copy(&[first.label; WIDTH], semantic),
+                (false, _) => copy(&std::array::from_fn(|element| self.label(pixels, element)), semantic),
             }
         }
         if let Some(binary) = planes.binary.get_mut(at..at + count) {
@@ -234,30 +251,55 @@ impl Resolver<'_> {
                 };
             }
         }
-        if !planes.have_colours() {
-            return;
+        if planes.have_colours() {
+            self.put_colours::<S>(pixels, at, count, planes);
         }
-        let sky = self.light.sky();
-        let colour = |element: usize| {
-            let surface = pixels.surface.0[element];
-            let colour = match surface {
-                GROUND_SURFACE => &self.ground_colours[usize::from(pixels.label[element])],
-                _ => &table[surface as usize].colour,
-            };
-            let clear = pixels.clear.0[element];
-            [0, 1, 2].map(|i: usize| sky[i] + clear * (colour[i] - sky[i]))
+    }
+
+    /// The class that a pixel sees.
+    #[inline(always)]
+    fn label(&self, pixels: &Pixels, element: usize) -> u8 {
+        match pixels.surface.0[element] {
+            GROUND_SURFACE => pixels.label[element],
+            surface => self.surfaces.surfaces[surface as usize].label,
+        }
+    }
+
+    #[inline(always)]
+    fn put_colours<S: Simd>(&self, pixels: &Pixels, at: usize, count: usize, planes: &mut ImagePlanes<'_>) {
+        let colour = |element: usize| match pixels.surface.0[element] {
+            GROUND_SURFACE => &self.ground_colours[usize::from(pixels.label[element])],
+            surface => &self.surfaces.surfaces[surface as usize].colour,
         };
-        if let Some(rgb) = planes.rgb.get_mut(at..at + count) {
-            for (element, to) in rgb.iter_mut().enumerate() {
-                *to = colour(element).map(|part| (part * 255.0 + 0.5).clamp(0.0, 255.0) as u8);
+        let mut parts = [Floats::ZERO; 3];
+        if pixels.is_uniform && pixels.surface.0[0] != GROUND_SURFACE {
+            let [red, green, blue] = colour(0);
+            parts = [Floats([*red; WIDTH]), Floats([*green; WIDTH]), Floats([*blue; WIDTH])];
+        } else {
+            for element in 0..WIDTH {
+                let [red, green, blue] = colour(element);
+                (parts[0].0[element], parts[1].0[element], parts[2].0[element]) = (*red, *green, *blue);
             }
+        }
+        let (sky, clear) = (self.light.sky(), S::load(&pixels.clear));
+        let red = S::splat(sky[0]) + clear * (S::load(&parts[0]) - S::splat(sky[0]));
+        let green = S::splat(sky[1]) + clear * (S::load(&parts[1]) - S::splat(sky[1]));
+        let blue = S::splat(sky[2]) + clear * (S::load(&parts[2]) - S::splat(sky[2]));
+        if let Some(rgb) = planes.rgb.get_mut(at..at + count) {
+            let (green, blue) = (S::left::<8>(byte::<S>(green)), S::left::<16>(byte::<S>(blue)));
+            let mut words = Words::ZERO;
+            S::store_words(S::or(S::or(byte::<S>(red), green), blue), &mut words);
+            copy(
+                &words.0.map(|word| [word as u8, (word >> 8) as u8, (word >> 16) as u8]),
+                rgb,
+            );
         }
         if let Some(brightness) = planes.brightness.get_mut(at..at + count) {
-            for (element, to) in brightness.iter_mut().enumerate() {
-                // Rec. 709.
-                let [red, green, blue] = colour(element);
-                *to = 0.2126 * red + 0.7152 * green + 0.0722 * blue;
-            }
+            // Rec. 709.
+            let luminance = S::splat(0.2126) * red + S::splat(0.7152) * green + S::splat(0.0722) * blue;
+            let mut to = Floats::ZERO;
+            S::store(luminance, &mut to);
+            copy(&to.0, brightness);
         }
     }
 
@@ -268,10 +310,7 @@ impl Resolver<'_> {
         let depths = S::load(&pixels.depth) * S::splat(self.thermal.extinction_per_m);
         S::store(crate::sensors::lidar::exp_minus::<S>(depths), &mut clear);
         for (element, to) in infrared.iter_mut().enumerate() {
-            let radiance = match pixels.surface.0[element] {
-                GROUND_SURFACE => self.thermal.of(pixels.label[element]),
-                surface => self.thermal.of(self.surfaces.surfaces[surface as usize].label),
-            };
+            let radiance = self.thermal.of(self.label(pixels, element));
             *to = self.thermal.pixel(radiance, clear.0[element]);
         }
     }
@@ -296,6 +335,27 @@ impl Resolver<'_> {
             };
         }
     }
+}
+
+/// The first of sixteen values; all of them without a call, which a copy of any length is.
+#[inline(always)]
+fn copy<T: Copy>(from: &[T; WIDTH], to: &mut [T]) {
+    match to.first_chunk_mut::<WIDTH>() {
+        Some(to) => *to = *from,
+        None => to.copy_from_slice(&from[..to.len()]),
+    }
+}
+
+/// Shares of 1 as whole numbers from 0 to 255, rounded to the nearest, halves up.
+#[inline(always)]
+fn byte<S: Simd>(share: S::F) -> S::U {
+    let magic = S::splat(8_388_608.0);
+    let value = share * S::splat(255.0) + S::splat(0.5);
+    let value = S::min(S::max(value, S::splat(0.0)), S::splat(255.0));
+    // The sum's mantissa holds the nearest whole number; one too many is taken off again.
+    let nearest = (value + magic) - magic;
+    let floor = S::select(S::lt(value, nearest), nearest - S::splat(1.0), nearest);
+    S::minus(S::words(floor + magic), S::words(magic))
 }
 
 #[inline(always)]

@@ -1,0 +1,50 @@
+//! Images and radar scans per second of one core: 500 buildings, 200 moving vehicles, 16 carriers; and images beside general renderers.
+//!
+//! `cargo run --release -p sensor-daemon --bin sights-bench -- camera|radar [--python PATH] [--quick] [--json FILE]`
+//!
+//! `--python` names an interpreter that can `import open3d` and `import mujoco` (`make peers`); without it the peers are left out. Times
+//! are of the thread's processor time, because other work may run on the machine.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a benchmark that cannot run panics with the reason"
+)]
+
+use std::path::PathBuf;
+
+mod camera;
+mod city;
+#[path = "../../../tests/lidar_city/mod.rs"]
+mod lidar_city;
+#[path = "../../../benches/peers/mod.rs"]
+mod peers;
+mod radar;
+
+/// Processor time of this thread, seconds.
+fn now_s() -> f64 {
+    ipc_schema::clock::seconds(rustix::time::ClockId::ThreadCPUTime)
+}
+
+fn main() {
+    let mut arguments = std::env::args().skip(1);
+    let part = arguments.next();
+    let (mut python, mut json, mut is_quick) = (None::<PathBuf>, None::<PathBuf>, false);
+    while let Some(argument) = arguments.next() {
+        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        match argument.as_str() {
+            "--python" => python = Some(value().into()),
+            "--json" => json = Some(value().into()),
+            "--quick" => is_quick = true,
+            other => panic!("unknown option {other}"),
+        }
+    }
+    let report = match part.as_deref() {
+        Some("camera") => camera::measure(python.as_deref(), is_quick),
+        Some("radar") => radar::measure(is_quick),
+        other => panic!("{other:?} is neither camera nor radar"),
+    };
+    if let Some(file) = json {
+        std::fs::write(&file, format!("{report:#}\n")).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+    }
+}
