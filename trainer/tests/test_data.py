@@ -23,7 +23,7 @@ from caraware.data import Recording, RecordingError, TickDataset, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.fcd import angle_deg
 from caraware.data.names import RoadUsers
-from recorded_run import TRAINED_TICKS, assert_has_card, unseen
+from recorded_run import TRAINED_TICKS, assert_has_card, recorded_run, unseen
 from torch.utils.data import DataLoader
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "figure.ipynb"
@@ -75,6 +75,21 @@ def test_episodes_and_vehicles_follow_the_truth_without_jumps(recording: Recordi
         # A vehicle moves as fast as its speed says.
         assert np.all(moved_m <= (truth[1:, 3] + 3.0) * recording.tick_s * np.diff(ticks) + 0.5)
         assert track.valid.dtype == np.bool_
+
+
+def test_the_stages_of_a_curriculum_are_the_lines_of_the_run_s_log() -> None:
+    stages = {
+        "curriculum.stages": "[{cavs=2,until_lessons=2},{cavs=3}]",
+        "episode.ticks": 20,
+        "episode.training_episodes": 4,
+        "episode.evaluation_interval": 0,
+        "episode.evaluation_ticks": 10,
+        "fanout.enabled": "false",
+    }
+    with recorded_run("simulate", stages) as run_dir:
+        logged = [json.loads(line) for line in (run_dir / "curriculum.jsonl").read_text().splitlines()]
+        assert [(line["stage"], line["lesson"], line["tick"]) for line in logged] == [(0, 0, 0), (1, 2, 40)]
+        assert list(open_recording(run_dir).lines("curriculum")) == logged
 
 
 def test_a_data_set_loads_in_batches(recording: Recording) -> None:

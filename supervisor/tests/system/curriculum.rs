@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::common::{CURRICULUM, Workplace, of_channel};
+use crate::common::{CURRICULUM, Workplace, lines_of, of_channel};
 use ipc_schema::{
     block,
     observation::{ObservationLayout, VALID},
@@ -14,6 +14,7 @@ use ipc_schema::{
     run::RunFile,
     services::{self, Channel, RunNode},
 };
+use recorder::file::{reader::RecordingReader, writer::LineTopic};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -135,11 +136,9 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
 fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
     let workplace = Workplace::new();
     let steps = "curriculum.stages=[{cavs=2,until_lessons=1},{cavs=3,until_std=0.001}]";
-    workplace.succeed(&arguments(
-        "train",
-        "stuck",
-        &[steps, "episode.training_episodes=3", "episode.ticks=120"],
-    ));
+    let settings = [steps, "episode.training_episodes=3", "episode.ticks=120"];
+    let train = arguments("train", "stuck", &settings);
+    workplace.succeed(&[&train[..], &["--record"]].concat());
     let report = workplace.report("stuck");
     let curriculum = &report["trainer"]["curriculum"];
     assert_eq!(
@@ -147,6 +146,16 @@ fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
         (&3.into(), 1)
     );
     assert_eq!(report["ticks"], 3 * 120 + 80);
+
+    // The recording has the decisions as the run's log has them.
+    let run = workplace.path().join("runs/stuck");
+    let log = std::fs::read_to_string(run.join("curriculum.jsonl")).unwrap();
+    let recording = RecordingReader::open(&run.join("recording.mcap")).unwrap();
+    assert_eq!(decisions(&workplace, "stuck").len(), 2, "{log}");
+    assert_eq!(
+        lines_of(&recording, LineTopic::Curriculum),
+        log.lines().collect::<Vec<_>>()
+    );
 }
 
 /// Stages over the town and a grid of 300 m: in order, at random, and gradually at random.

@@ -7,12 +7,9 @@ use std::{
     process::{Child, Stdio},
 };
 
-use crate::common::{ACTING, Spectator, Workplace, assert_documented, free_port, text, until, with_mounts};
+use crate::common::{ACTING, Spectator, Workplace, assert_documented, free_port, lines_of, text, until, with_mounts};
 use ipc_schema::{activity::Awaited, channel::Channel, process::Process};
-use recorder::file::{
-    reader::{RecordedMessage, RecordingReader},
-    writer::LineTopic,
-};
+use recorder::file::{reader::RecordingReader, writer::LineTopic};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// A short training run of six vehicles with small networks, without viewers.
@@ -382,14 +379,7 @@ fn recorders_that_watch_do_not_change_a_run_and_count_what_they_miss() {
     }
     // The command is in the recording as it is in the run's log.
     let log = std::fs::read_to_string(directory.join("commands.jsonl")).unwrap();
-    let recorded_lines: Vec<String> = RecordingReader::open(&file)
-        .unwrap()
-        .messages()
-        .filter_map(|message| match message.unwrap() {
-            RecordedMessage::Line(LineTopic::Commands, line) => Some(line),
-            _ => None,
-        })
-        .collect();
+    let recorded_lines = lines_of(&RecordingReader::open(&file).unwrap(), LineTopic::Commands);
     assert!(log.contains("imu"), "{log}");
     assert_eq!(recorded_lines, log.lines().collect::<Vec<_>>());
     // A channel that does not exist is refused with the names of those that do.

@@ -22,7 +22,10 @@ use ipc_schema::{
     services::{self, Channel, RunNode},
     world::{VehicleState, WorldLayout},
 };
-use recorder::file::reader::{ChannelMessage, RecordingReader};
+use recorder::file::{
+    reader::{ChannelMessage, RecordedMessage, RecordingReader},
+    writer::LineTopic,
+};
 use rustix::{
     fs::inotify,
     process::{Pid, Signal, kill_process},
@@ -217,6 +220,16 @@ pub const ONE_TICK_AHEAD: &str = "run.window_ticks=1";
 pub fn of_channel(recording: &RecordingReader, channel: Channel) -> impl Iterator<Item = ChannelMessage> {
     let messages = recording.channel_messages().map(Result::unwrap);
     messages.filter(move |message| message.channel == channel)
+}
+
+/// The lines of one of the run's logs in a recording.
+pub fn lines_of(recording: &RecordingReader, topic: LineTopic) -> Vec<String> {
+    let messages = recording.messages().map(Result::unwrap);
+    let lines = messages.filter_map(|message| match message {
+        RecordedMessage::Line(found, line) if found == topic => Some(line),
+        _ => None,
+    });
+    lines.collect()
 }
 
 /// The road users of every tick in a recording.
