@@ -34,7 +34,7 @@ pub enum BenchPart {
     Driving,
     /// Recording: wall time of a run that is recorded, as a watcher and without loss, compared with the same run alone
     Record,
-    /// Watching: wall and processor time of a tick with a recorder beside the run, compared with the same run without, segment by segment
+    /// Watching: wall and processor time of a tick with a recorder beside the run, compared with the same tick of an equal run without
     Watch,
     /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
     Endurance,
@@ -81,7 +81,7 @@ pub struct BenchArgs {
     /// Measure only a small case: tests that the benchmark works, not how fast caraware is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
-    /// Time for which `endurance` disturbs runs, `soak` watches one, and `watch` compares segments, minutes; `endurance` completes the last run
+    /// Time for which `endurance` disturbs runs, `soak` watches one, and `watch` compares stretches of ticks, minutes; `endurance` completes the last run
     #[arg(long, value_name = "MINUTES", default_value_t = 10)]
     pub minutes: u32,
     /// Seed of the moments and kinds of `endurance`'s disturbances

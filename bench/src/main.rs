@@ -4,6 +4,7 @@
 
 mod allocator;
 mod cli;
+mod cores;
 mod driving;
 mod endurance;
 mod envs;

@@ -1,6 +1,12 @@
-//! Measures what a recorder beside a live run costs it: in one run, with the recorder there and not there, in many short segments.
+//! Measures what a recorder beside a live run costs it: two equal runs go side by side, and a recorder watches now the one, now the other.
+//!
+//! The time of a tick changes by a factor of three with the traffic lights, so only the same ticks can be compared: one run makes them
+//! with a recorder, the other run makes them without. In the next stretch of ticks the roles change. The geometric mean of both ratios
+//! leaves out that the cores of one run are faster. Stretches are short, because the speed of a core changes from second to second
+//! where others use the machine too.
 
 use std::{
+    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
     process::{Child, Command, Stdio},
@@ -11,64 +17,95 @@ use caraware::{failure::Exit, generate::GeneratedCity, install, install::Install
 use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal};
 
-use super::{BenchOptions, BenchReport, ReportTable, sides::BenchDirectory};
+use super::{BenchOptions, BenchReport, ReportTable, cores::CorePlan, sides::BenchDirectory};
 use crate::target::signal;
 
-const NAME: &str = "watched";
-/// Time for the run to start, and for a recorder to begin or end.
+/// Names of the two runs.
+const NAMES: [&str; 2] = ["one", "other"];
+/// Time for a run to start, and for a tick.
 const DEADLINE: Duration = Duration::from_secs(120);
-/// The processes whose work the ticks are.
+/// The processes whose work the ticks are. Each has one thread that works.
 const LOOP: [Process; 3] = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon];
-/// Simulated time of the city, seconds: more than a measurement takes, because the run is stopped at its end.
-const CITY_S: f64 = 7200.0;
+/// Cores beside those of the loops: so many that a recorder compresses on two threads.
+const OTHER_CORES: usize = 6;
+/// Simulated time of the city, seconds: more than a measurement takes, because the runs are stopped at its end.
+const CITY_S: f64 = 21_600.0;
+/// Time between two looks at the runs: a small part of a tick.
+const POLL: Duration = Duration::from_micros(200);
 /// Most that watching may cost.
 const MOST: f64 = 1.01;
-/// Cores of the loop's processes, and one for the recorder.
-const CORES: usize = 5;
 
 /// How much is measured.
 struct WatchSize {
     vehicles: u32,
-    /// Time for blocks of one watched segment and two without a recorder, in random order; there are two blocks at least.
+    /// Time for pairs of stretches.
     time: Duration,
-    /// Time between a change and the segment.
-    settling: Duration,
-    segment: Duration,
+    /// Ticks of a stretch.
+    stretch: u64,
+    /// Ticks at its beginning that are not measured, because a recorder comes or goes.
+    settling: u64,
 }
 
 const SIZE: WatchSize = WatchSize {
     vehicles: 1000,
     time: Duration::from_secs(60),
-    settling: Duration::from_millis(300),
-    segment: Duration::from_millis(2000),
+    stretch: 70,
+    settling: 30,
 };
 const QUICK: WatchSize = WatchSize {
     vehicles: 60,
     time: Duration::ZERO,
-    settling: Duration::from_millis(50),
-    segment: Duration::from_millis(300),
+    stretch: 3000,
+    settling: 1500,
 };
 
-/// What happens in a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Segment {
-    /// No recorder is there. There are two such segments in a block, which show how far equal segments differ.
-    Alone(usize),
-    Watched,
+impl WatchSize {
+    /// Most ticks by which the first or last look at a stretch may be late. A stretch that is looked at later is left out.
+    fn tolerance(&self) -> u64 {
+        self.stretch / 50
+    }
 }
 
-/// What a segment has cost.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct SegmentCost {
-    wall_s_per_tick: f64,
-    /// Processor time of the loop's processes.
-    cpu_s_per_tick: f64,
+/// Which stretches of ticks are watched in which run. Two stretches in a row are a pair. In two of three pairs the one run is watched in the
+/// first stretch and the other run in the second; in the third neither is, which shows how far equal stretches differ.
+#[derive(Debug, Clone, Copy)]
+struct WatchPlan {
+    seed: u64,
 }
 
-/// Runs a generated city once, and records it for some of the time.
+impl WatchPlan {
+    /// True if a recorder is there in this pair of stretches.
+    fn has_recorder(pair: u64) -> bool {
+        pair % 3 != 2
+    }
+
+    /// The run that is watched in the first stretch of a pair: at random.
+    fn first_run(self, pair: u64) -> usize {
+        usize::from(fastrand::Rng::with_seed(self.seed.wrapping_add(pair)).bool())
+    }
+
+    fn is_watched(self, run: usize, stretch: u64) -> bool {
+        let pair = stretch / 2;
+        Self::has_recorder(pair) && (self.first_run(pair) == run) == stretch.is_multiple_of(2)
+    }
+}
+
+/// What can be compared: the wall time, and the processor times of the loop and of each of its processes.
+const COSTS: [&str; 2 + LOOP.len()] = [
+    "wall time",
+    "processor time",
+    "processor time of `traffic-bridge`",
+    "processor time of `sim-core`",
+    "processor time of `sensor-daemon`",
+];
+
+/// What a run had paid at a moment, or pays for each tick of a stretch; seconds, by [`COSTS`].
+type Costs = [f64; COSTS.len()];
+
+/// Runs a generated city twice at once, and records the one or the other for some of the time.
 ///
 /// # Errors
-/// The run cannot be started, or ends by itself.
+/// A run cannot be started, or ends by itself.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let size = if options.quick {
         QUICK
@@ -79,106 +116,118 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         }
     };
     let place = BenchDirectory::new("watch")?;
-    let mut run = WatchedRun::start(options, &size, &place)?;
-    let mut random = fastrand::Rng::with_seed(options.seed);
-    let mut ratios = SegmentRatios::default();
-    let (begin, mut blocks) = (Instant::now(), 0);
-    while blocks < 2 || begin.elapsed() < size.time {
-        blocks += 1;
-        let mut order = [Segment::Alone(0), Segment::Alone(1), Segment::Watched];
-        random.shuffle(&mut order);
-        let (mut alone, mut watched) = ([None; 2], None);
-        for segment in order {
-            let cost = run.segment(segment, &size)?;
-            match segment {
-                Segment::Alone(number) => alone[number] = Some(cost),
-                Segment::Watched => watched = Some(cost),
-            }
+    let plan = WatchPlan { seed: options.seed };
+    let cores = CorePlan::of_machine(NAMES.len() * LOOP.len(), OTHER_CORES)?;
+    let mut runs = RunPair::start(options, &size, &place, cores.as_ref())?;
+    let begin = Instant::now();
+    let mut ratios = PairRatios::default();
+    while ratios.watched.len() < 2 || ratios.alone.len() < 2 || begin.elapsed() < size.time {
+        if runs.look(&size, plan)? {
+            ratios = PairRatios::of(plan, &runs.costs());
         }
-        if let ([Some(first), Some(second)], Some(watched)) = (alone, watched) {
-            ratios.add([first, second], watched);
-        }
+        std::thread::park_timeout(POLL);
     }
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
-    let (missed, message_mb_per_s) = (run.missed_ticks, run.message_mb / run.recorded_s.max(1e-9));
-    run.stop()?;
-    let mut report = report(&size, &ratios, missed, message_mb_per_s, load.trim())?;
+    let received = runs.stop()?;
+    if let Some(cores) = &cores {
+        cores.release()?;
+    }
+    let mut report = report(&size, &ratios, received, load.trim(), cores.is_some())?;
     report.command = format!("caraware bench watch --minutes {}", options.minutes);
     Ok(report)
 }
 
 fn report(
     size: &WatchSize,
-    ratios: &SegmentRatios,
-    missed: f64,
-    message_mb_per_s: f64,
+    ratios: &PairRatios,
+    received: Received,
     load: &str,
+    is_pinned: bool,
 ) -> Result<BenchReport, Exit> {
-    let [wall, cpu, null_wall, null_cpu] =
-        [&ratios.wall, &ratios.cpu, &ratios.null_wall, &ratios.null_cpu].map(|ratios| MedianInterval::of(ratios));
-    let wall = wall.ok_or_else(|| Exit::run("no segment was measured", ""))?;
+    let message_mb_per_s = received.message_mb / received.wall_s.max(1e-9);
     let mut report = BenchReport::new(
         "watch",
         "A recorder that watches",
         format!(
-            "{} vehicles on a generated city, `caraware simulate` at full speed without viewers, one run. {} blocks of three segments of {:.1} s \
-             in random order: with `caraware record` beside the run, and twice without. A ratio compares the watched segment of a block with \
-             the mean of the other two; the last rows compare those two with each other. Intervals are those of the median, 95 % at least, from the \
-             order of the ratios alone. Processor time is that of `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorder received {:.0} \
-             MB/s and missed {missed:.0} ticks. Load of the machine at the end: {load}.",
+            "{} vehicles on a generated city, `caraware simulate` at full speed without viewers, two equal runs side by side. Stretches of {} \
+             ticks are compared with the same ticks of the other run, without the first {}, in which a recorder comes or goes. In {} pairs of \
+             stretches `caraware record` is beside the one run and then beside the other, and a ratio is the geometric mean of both. \
+             `alone beside alone` is the same of {} pairs between them without a recorder. Intervals are those of the median, 95 % at least, \
+             from the order of the ratios alone. Processor time is that of `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorders \
+             received {message_mb_per_s:.0} MB/s and missed {:.0} ticks. At the end one run was {} ticks ahead, and the load of the machine \
+             was {load}.",
             size.vehicles,
-            ratios.wall.len(),
-            size.segment.as_secs_f64(),
-            message_mb_per_s,
+            size.stretch,
+            size.settling,
+            ratios.watched.len(),
+            ratios.alone.len(),
+            received.missed_ticks,
+            received.ticks_apart,
         ),
     );
     let mut table = ReportTable::new("of alone", &["what", "median", "95 % interval"]);
-    for (name, interval) in [
-        ("wall time of a tick, watched", Some(wall)),
-        ("processor time of a tick, watched", cpu),
-        ("wall time of a tick, alone beside alone", null_wall),
-        ("processor time of a tick, alone beside alone", null_cpu),
-    ] {
-        let Some(interval) = interval else { continue };
-        let MedianInterval { median, low, high } = interval;
-        table.row([name.into(), format!("{median:.4}"), format!("{low:.4}–{high:.4}")]);
-        for (part, value) in [("median", median), ("low", low), ("high", high)] {
-            report.figure(format!("{name}, {part}"), value);
+    let mut watched_low = f64::NAN;
+    for (beside, ratios) in [("watched", &ratios.watched), ("alone beside alone", &ratios.alone)] {
+        for (cost, name) in COSTS.into_iter().enumerate() {
+            let values: Vec<f64> = ratios.iter().map(|costs| costs[cost]).collect();
+            let Some(MedianInterval { median, low, high }) = MedianInterval::of(&values) else {
+                return Err(Exit::run("no stretch was measured", ""));
+            };
+            if (cost, beside) == (0, "watched") {
+                watched_low = low;
+            }
+            let name = format!("{name} of a tick, {beside}");
+            table.row([name.clone(), format!("{median:.4}"), format!("{low:.4}–{high:.4}")]);
+            for (part, value) in [("median", median), ("low", low), ("high", high)] {
+                report.figure(format!("{name}, {part}"), value);
+            }
         }
     }
     report.tables.push(table);
-    report.figure("ticks missed", missed);
+    report.figure("ticks missed", received.missed_ticks);
     report.figure("MB/s of messages", message_mb_per_s);
-    if report.machine.cores < CORES {
+    if is_pinned {
+        report.text += " Each process of the loops had a core of its own.";
+        if watched_low > MOST {
+            let fault = format!("watching costs more than 1 %: {watched_low:.4} at least");
+            report.faults.push(fault);
+        }
+    } else {
         report.text += &format!(
-            " With fewer than {CORES} cores the recorder takes processor time from the run itself: nothing follows from the ratio of wall times."
+            " With fewer than {} cores the runs and the recorder take processor time from each other: nothing follows from the wall times.",
+            NAMES.len() * LOOP.len() + OTHER_CORES
         );
-    } else if wall.low > MOST {
-        report
-            .faults
-            .push(format!("watching costs more than 1 %: {:.4}", wall.median));
     }
     Ok(report)
 }
 
-/// Ratios of all blocks.
+/// Ratios of the pairs that both runs have measured.
 #[derive(Debug, Default)]
-struct SegmentRatios {
-    wall: Vec<f64>,
-    cpu: Vec<f64>,
-    null_wall: Vec<f64>,
-    null_cpu: Vec<f64>,
+struct PairRatios {
+    /// A watched run to the other.
+    watched: Vec<Costs>,
+    /// The same of pairs without a recorder.
+    alone: Vec<Costs>,
 }
 
-impl SegmentRatios {
-    fn add(&mut self, [first, second]: [SegmentCost; 2], watched: SegmentCost) {
-        let of_mean = |value: f64, alone: [f64; 2]| value / f64::midpoint(alone[0], alone[1]);
-        let wall = [first, second].map(|cost| cost.wall_s_per_tick);
-        let cpu = [first, second].map(|cost| cost.cpu_s_per_tick);
-        self.wall.push(of_mean(watched.wall_s_per_tick, wall));
-        self.cpu.push(of_mean(watched.cpu_s_per_tick, cpu));
-        self.null_wall.push(wall[0] / wall[1]);
-        self.null_cpu.push(cpu[0] / cpu[1]);
+impl PairRatios {
+    /// Ratios of the costs of both runs, by stretch.
+    fn of(plan: WatchPlan, costs: &[&BTreeMap<u64, Costs>; 2]) -> Self {
+        let mut ratios = Self::default();
+        let stretches = costs[0].keys().filter(|stretch| stretch.is_multiple_of(2));
+        for pair in stretches.map(|stretch| stretch / 2) {
+            let run = plan.first_run(pair);
+            let at = |run: usize, half: u64| costs[run].get(&(2 * pair + half));
+            let (Some(a), Some(b), Some(c), Some(d)) = (at(run, 0), at(1 - run, 0), at(1 - run, 1), at(run, 1)) else {
+                continue;
+            };
+            let crossed = std::array::from_fn(|cost| (a[cost] / b[cost] * (c[cost] / d[cost])).sqrt());
+            match WatchPlan::has_recorder(pair) {
+                true => ratios.watched.push(crossed),
+                false => ratios.alone.push(crossed),
+            }
+        }
+        ratios
     }
 }
 
@@ -214,22 +263,108 @@ impl MedianInterval {
     }
 }
 
-/// The run that is measured. Dropping it ends it.
-struct WatchedRun {
+/// The runs that are measured.
+struct RunPair {
+    caraware: PathBuf,
+    place: PathBuf,
+    runs: Vec<LiveRun>,
+}
+
+/// What the recorders have received, and how far the runs were apart at the end.
+#[derive(Debug, Clone, Copy)]
+struct Received {
+    missed_ticks: f64,
+    message_mb: f64,
+    wall_s: f64,
+    ticks_apart: u64,
+}
+
+impl RunPair {
+    fn start(
+        options: &BenchOptions,
+        size: &WatchSize,
+        place: &BenchDirectory,
+        cores: Option<&CorePlan>,
+    ) -> Result<Self, Exit> {
+        let city = GeneratedCity::of(size.vehicles, CITY_S, 0.1, 1);
+        let sumocfg = city.write(&Install::find()?, &place.path().join("city"))?;
+        let mut pair = Self {
+            caraware: install::program(&options.bin, "caraware")?,
+            place: place.path().to_owned(),
+            runs: Vec::new(),
+        };
+        // What is started from here on is not on the cores of the loops.
+        cores.map_or(Ok(()), CorePlan::keep_off)?;
+        for (index, name) in NAMES.into_iter().enumerate() {
+            let run = LiveRun::start(&pair.caraware, &pair.place, name, &sumocfg)?;
+            if let Some(cores) = cores {
+                let pids = run.boards.iter().map(|board| board.health().pid);
+                cores.pin(index * LOOP.len(), pids)?;
+            }
+            pair.runs.push(run);
+        }
+        Ok(pair)
+    }
+
+    /// Looks at both runs, and lets recorders come and go. True if a stretch has been measured.
+    fn look(&mut self, size: &WatchSize, plan: WatchPlan) -> Result<bool, Exit> {
+        let mut is_measured = false;
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            is_measured |= run.look(size, |stretch| plan.is_watched(index, stretch))?;
+        }
+        Ok(is_measured)
+    }
+
+    /// What each run has paid for a tick of each stretch.
+    fn costs(&self) -> [&BTreeMap<u64, Costs>; 2] {
+        [0, 1].map(|run: usize| &self.runs[run].costs)
+    }
+
+    fn stop(mut self) -> Result<Received, Exit> {
+        let ticks = [0, 1].map(|run: usize| self.runs[run].tick());
+        for run in &mut self.runs {
+            run.end_recorder()?;
+            let stopped = command(&self.caraware, &self.place).args(["stop", run.name]).status();
+            stopped.map_err(|error| Exit::io("start", &self.caraware, &error))?;
+            let status = run.child.wait();
+            status.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
+        }
+        let sum = |part: fn(&LiveRun) -> f64| self.runs.iter().map(part).sum();
+        Ok(Received {
+            missed_ticks: sum(|run| run.missed_ticks),
+            message_mb: sum(|run| run.message_mb),
+            wall_s: sum(|run| run.recorded_s),
+            ticks_apart: ticks[0].abs_diff(ticks[1]),
+        })
+    }
+}
+
+/// One of the runs. Dropping it ends it.
+struct LiveRun {
+    name: &'static str,
     caraware: PathBuf,
     place: PathBuf,
     child: Child,
-    recorder: Option<Child>,
     /// Boards of [`LOOP`].
     boards: Vec<BoardReader>,
+    /// The stretch that is under way.
+    stretch: Option<u64>,
+    /// The tick that its measurement began with, and what the run had paid then; `None` before that, and in a stretch that is left out.
+    begun: Option<(u64, Costs)>,
+    costs: BTreeMap<u64, Costs>,
+    newest_tick: (u64, Instant),
+    recorder: Option<(Child, Instant)>,
+    /// A recorder that was asked to end.
+    ending: Option<Child>,
     missed_ticks: f64,
     message_mb: f64,
     recorded_s: f64,
 }
 
-impl Drop for WatchedRun {
+impl Drop for LiveRun {
     fn drop(&mut self) {
-        for child in self.recorder.iter_mut().chain([&mut self.child]) {
+        let recorder = self.recorder.as_mut().map(|(recorder, _)| recorder);
+        for child in recorder.into_iter().chain(&mut self.ending).chain([&mut self.child]) {
             if matches!(child.try_wait(), Ok(None)) {
                 signal(Pid::from_child(child), Signal::TERM);
                 let _ = child.wait();
@@ -238,35 +373,40 @@ impl Drop for WatchedRun {
     }
 }
 
-impl WatchedRun {
-    fn start(options: &BenchOptions, size: &WatchSize, place: &BenchDirectory) -> Result<Self, Exit> {
-        let caraware = install::program(&options.bin, "caraware")?;
-        let city = GeneratedCity::of(size.vehicles, CITY_S, 0.1, 1);
-        let sumocfg = city.write(&Install::find()?, &place.path().join("city"))?;
+impl LiveRun {
+    /// Starts a run and waits for its first tick.
+    fn start(caraware: &Path, place: &Path, name: &'static str, sumocfg: &Path) -> Result<Self, Exit> {
         let settings = [
             "fanout.enabled=false",
             "map.origin_latitude_deg=52.0",
             "map.origin_longitude_deg=10.0",
         ];
-        let child = command(&caraware, place.path())
+        let child = command(caraware, place)
             .arg("simulate")
-            .arg(&sumocfg)
-            .args(["--quiet", "--name", NAME])
+            .arg(sumocfg)
+            .args(["--quiet", "--name", name])
             .args(settings.into_iter().flat_map(|setting| ["--set", setting]))
             .spawn()
-            .map_err(|error| Exit::io("start", &caraware, &error))?;
+            .map_err(|error| Exit::io("start", caraware, &error))?;
         let mut run = Self {
-            caraware,
-            place: place.path().to_owned(),
+            name,
+            caraware: caraware.to_owned(),
+            place: place.to_owned(),
             child,
-            recorder: None,
             boards: Vec::new(),
+            stretch: None,
+            begun: None,
+            costs: BTreeMap::new(),
+            newest_tick: (0, Instant::now()),
+            recorder: None,
+            ending: None,
             missed_ticks: 0.0,
             message_mb: 0.0,
             recorded_s: 0.0,
         };
-        let run_file = place.path().join("runs").join(NAME).join("run.json");
-        run.wait_until("the run has started", |run| {
+        let run_file = place.join("runs").join(name).join("run.json");
+        while run.tick() == 0 {
+            run.check_alive()?;
             if run.boards.is_empty()
                 && let Ok(file) = RunFile::read(&run_file)
                 && let Ok(node) = services::node(&file.shared_memory)
@@ -274,76 +414,117 @@ impl WatchedRun {
                 let boards = LOOP.map(|process| BoardReader::open(&node, &file, 0, process));
                 run.boards = boards.into_iter().collect::<Result<_, _>>().unwrap_or_default();
             }
-            run.boards.last().is_some_and(|board| board.health().ticks > 0)
-        })?;
+            std::thread::park_timeout(Duration::from_millis(5));
+        }
         Ok(run)
+    }
+
+    /// Ticks that are sensed.
+    fn tick(&self) -> u64 {
+        self.boards.last().map_or(0, |board| board.health().ticks)
     }
 
     fn check_alive(&mut self) -> Result<(), Exit> {
         match self.child.try_wait() {
-            Ok(None) => Ok(()),
+            Ok(None) if self.newest_tick.1.elapsed() < DEADLINE => Ok(()),
+            Ok(None) => Err(Exit::run(
+                format!("a run made no tick in {DEADLINE:.0?}"),
+                "see its logs",
+            )),
             Ok(Some(status)) => Err(Exit::run(
-                format!("the run ended by itself with {status}"),
-                "its city lasts two simulated hours: give a smaller measurement to a faster machine",
+                format!("a run ended by itself with {status}"),
+                "its city lasts six simulated hours: give a smaller measurement to a faster machine",
             )),
             Err(error) => Err(Exit::io("wait for", &self.caraware, &error)),
         }
     }
 
-    fn wait_until(&mut self, what: &str, mut is_so: impl FnMut(&mut Self) -> bool) -> Result<(), Exit> {
-        let begun = Instant::now();
-        while !is_so(self) {
+    /// Looks at the newest tick. Measures stretches, and starts and ends recorders where stretches begin. True if a stretch has been measured.
+    fn look(&mut self, size: &WatchSize, is_watched: impl Fn(u64) -> bool) -> Result<bool, Exit> {
+        let tick = self.tick();
+        if tick == self.newest_tick.0 {
             self.check_alive()?;
-            if begun.elapsed() > DEADLINE {
-                return Err(Exit::run(format!("waited {DEADLINE:.0?} until {what}"), "see its logs"));
-            }
-            std::thread::park_timeout(Duration::from_millis(5));
+            return Ok(false);
         }
+        self.newest_tick = (tick, Instant::now());
+        let (stretch, ticks_in) = (tick / size.stretch, tick % size.stretch);
+        let is_on_time = |from: u64| (from..=from + size.tolerance()).contains(&ticks_in);
+        let mut is_measured = false;
+        if self.stretch != Some(stretch) {
+            if let (Some(before), Some((first_tick, begin))) = (self.stretch, self.begun.take())
+                && before + 1 == stretch
+                && is_on_time(0)
+            {
+                let (ticks, end) = ((tick - first_tick) as f64, self.paid());
+                let costs = std::array::from_fn(|cost| (end[cost] - begin[cost]) / ticks);
+                self.costs.insert(before, costs);
+                is_measured = true;
+            }
+            self.stretch = Some(stretch);
+            match (self.recorder.is_some(), is_watched(stretch)) {
+                (false, true) => self.start_recorder()?,
+                (true, false) => self.ask_recorder_to_end(),
+                _ => {}
+            }
+        } else if self.begun.is_none() && is_on_time(size.settling) {
+            // Its first bytes are there once it has attached to the run.
+            let is_recorded = fs::metadata(self.recording()).is_ok_and(|file| file.len() > 0);
+            if self.recorder.is_none() || is_recorded {
+                self.begun = Some((tick, self.paid()));
+            }
+        }
+        Ok(is_measured)
+    }
+
+    /// What the run has paid so far.
+    fn paid(&self) -> Costs {
+        let healths = self.boards.iter().map(BoardReader::health);
+        let written_ns = healths.clone().last().map_or(0, |health| health.written_ns);
+        let cpu_s: Vec<f64> = healths.map(|health| threads_cpu_s(health.pid)).collect();
+        let mut paid = [0.0; COSTS.len()];
+        paid[0] = written_ns as f64 * 1e-9;
+        paid[1] = cpu_s.iter().sum();
+        paid[2..].copy_from_slice(&cpu_s);
+        paid
+    }
+
+    fn recording(&self) -> PathBuf {
+        self.place.join(format!("{}.mcap", self.name))
+    }
+
+    fn start_recorder(&mut self) -> Result<(), Exit> {
+        self.end_recorder()?;
+        let recorder = command(&self.caraware, &self.place)
+            .args(["record", self.name, "--output"])
+            .arg(self.recording())
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(|error| Exit::io("start", &self.caraware, &error))?;
+        self.recorder = Some((recorder, Instant::now()));
         Ok(())
     }
 
-    /// Measures one segment.
-    fn segment(&mut self, segment: Segment, size: &WatchSize) -> Result<SegmentCost, Exit> {
-        let file = self.place.join("segment.mcap");
-        if segment == Segment::Watched {
-            self.recorder = Some(self.start_recorder(&file)?);
-            // Its first bytes are there once it has attached to the run.
-            self.wait_until("the recorder has begun", |_| {
-                fs::metadata(&file).is_ok_and(|file| file.len() > 0)
-            })?;
+    fn ask_recorder_to_end(&mut self) {
+        if let Some((recorder, begun)) = self.recorder.take() {
+            signal(Pid::from_child(&recorder), Signal::INT);
+            self.recorded_s += begun.elapsed().as_secs_f64();
+            self.ending = Some(recorder);
         }
-        pause(size.settling);
-        let (begun, before) = (Instant::now(), self.work());
-        pause(size.segment);
-        let (wall_s, after) = (begun.elapsed().as_secs_f64(), self.work());
-        self.check_alive()?;
-        if let Some(recorder) = self.recorder.take() {
-            self.stop_recorder(recorder, &file, size.settling.as_secs_f64() + wall_s)?;
-        }
-        let ticks = after.ticks - before.ticks;
-        if ticks <= 0.0 {
-            return Err(Exit::run("a segment has no tick", "see the logs of the run"));
-        }
-        Ok(SegmentCost {
-            wall_s_per_tick: wall_s / ticks,
-            cpu_s_per_tick: (after.cpu_s - before.cpu_s) / ticks,
-        })
     }
 
-    fn start_recorder(&self, file: &Path) -> Result<Child, Exit> {
-        command(&self.caraware, &self.place)
-            .args(["record", NAME, "--output"])
-            .arg(file)
-            .stdout(Stdio::piped())
-            .spawn()
-            .map_err(|error| Exit::io("start", &self.caraware, &error))
-    }
-
-    /// Ends the recorder, counts what it has received, and removes its file.
-    fn stop_recorder(&mut self, recorder: Child, file: &Path, recorded_s: f64) -> Result<(), Exit> {
-        signal(Pid::from_child(&recorder), Signal::INT);
+    /// Waits for the end of a recorder, counts what it has received, and removes its file.
+    fn end_recorder(&mut self) -> Result<(), Exit> {
+        self.ask_recorder_to_end();
+        let Some(recorder) = self.ending.take() else {
+            return Ok(());
+        };
         let output = recorder.wait_with_output();
         let output = output.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
+        let file = self.recording();
+        if !file.exists() {
+            // The stretch was over before it had begun.
+            return Ok(());
+        }
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
         // Its last line: `FILE: A MB of B MB, N ticks missed`.
         let before = |word: &str| said.rsplit_once(word)?.0.split_whitespace().last()?.parse::<f64>().ok();
@@ -355,34 +536,8 @@ impl WatchedRun {
         };
         self.message_mb += message_mb;
         self.missed_ticks += missed;
-        self.recorded_s += recorded_s;
-        fs::remove_file(file).map_err(|error| Exit::io("remove", file, &error))
+        fs::remove_file(&file).map_err(|error| Exit::io("remove", &file, &error))
     }
-
-    /// Ticks that are sensed, and the processor time of the loop's processes.
-    fn work(&self) -> LoopWork {
-        let healths = self.boards.iter().map(BoardReader::health);
-        let cpu_s = healths.clone().map(|health| threads_cpu_s(health.pid)).sum();
-        LoopWork {
-            ticks: healths.last().map_or(0.0, |health| health.ticks as f64),
-            cpu_s,
-        }
-    }
-
-    fn stop(mut self) -> Result<(), Exit> {
-        let stopped = command(&self.caraware, &self.place).args(["stop", NAME]).status();
-        stopped.map_err(|error| Exit::io("start", &self.caraware, &error))?;
-        let status = self.child.wait();
-        status.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
-        Ok(())
-    }
-}
-
-/// What the loop has done at a moment.
-#[derive(Debug, Clone, Copy)]
-struct LoopWork {
-    ticks: f64,
-    cpu_s: f64,
 }
 
 /// Processor time of all threads of a process, seconds. The kernel counts it in nanoseconds here.
@@ -396,14 +551,6 @@ fn threads_cpu_s(pid: i32) -> f64 {
         text.split_whitespace().next()?.parse::<f64>().ok()
     });
     nanoseconds.sum::<f64>() * 1e-9
-}
-
-/// A pause that nothing shortens.
-fn pause(time: Duration) {
-    let begun = Instant::now();
-    while let Some(left) = time.checked_sub(begun.elapsed()).filter(|left| !left.is_zero()) {
-        std::thread::park_timeout(left);
-    }
 }
 
 /// A silent command whose runs and registry are in `place`.
@@ -437,17 +584,31 @@ mod tests {
         assert_eq!(MedianInterval::of(&[]), None);
     }
 
+    /// Ticks differ in work, the second run has faster cores, both slow down, and watching costs 5 %.
     #[test]
-    fn a_ratio_is_that_of_the_block() {
-        let cost = |wall_s_per_tick: f64| SegmentCost {
-            wall_s_per_tick,
-            cpu_s_per_tick: 2.0 * wall_s_per_tick,
+    fn neither_the_work_nor_the_cores_are_in_the_ratios() {
+        let plan = WatchPlan { seed: 1 };
+        let cost = |run: usize, stretch: u64| {
+            let work = [3.0, 7.0, 2.0, 5.0][stretch as usize % 4];
+            let cores = [1.6, 1.0][run];
+            let watching = if plan.is_watched(run, stretch) { 1.05 } else { 1.0 };
+            [work * cores * watching; COSTS.len()]
         };
-        let mut ratios = SegmentRatios::default();
-        ratios.add([cost(1.0), cost(3.0)], cost(4.0));
-        assert_eq!(
-            (ratios.wall[0], ratios.cpu[0], ratios.null_wall[0]),
-            (2.0, 2.0, 1.0 / 3.0)
-        );
+        let costs = [0, 1].map(|run: usize| (0..40).map(|stretch| (stretch, cost(run, stretch))).collect());
+        let ratios = PairRatios::of(plan, &costs.each_ref());
+        assert_eq!((ratios.watched.len(), ratios.alone.len()), (14, 6));
+        for (ratios, expected) in [(&ratios.watched, 1.05), (&ratios.alone, 1.0)] {
+            let values = ratios.as_flattened();
+            assert!(
+                values.iter().all(|ratio| (ratio - expected).abs() < 1e-12),
+                "{values:?}"
+            );
+        }
+        // Either run is the first, and a pair that one run lacks gives nothing.
+        let firsts: Vec<usize> = (0..20).map(|pair| plan.first_run(pair)).collect();
+        assert!(firsts.contains(&0) && firsts.contains(&1), "{firsts:?}");
+        let [whole, mut short]: [BTreeMap<u64, Costs>; 2] = costs;
+        short.remove(&1);
+        assert_eq!(PairRatios::of(plan, &[&whole, &short]).watched.len(), 13);
     }
 }
