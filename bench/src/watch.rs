@@ -4,6 +4,9 @@
 //! with a recorder, the other run makes them without. In the next stretch of ticks the roles change. The geometric mean of both ratios
 //! leaves out that the cores of one run are faster. Stretches are short, because the speed of a core changes from second to second
 //! where others use the machine too.
+//!
+//! A recorder also takes cores, caches and memory, as any program does. A third run that is not measured shows how much that is: in some
+//! stretches the recorder watches that one instead.
 
 use std::{
     collections::BTreeMap,
@@ -20,8 +23,8 @@ use rustix::process::{Pid, Signal};
 use super::{BenchOptions, BenchReport, ReportTable, cores::CorePlan, sides::BenchDirectory};
 use crate::target::signal;
 
-/// Names of the two runs.
-const NAMES: [&str; 2] = ["one", "other"];
+/// Names of the runs: the two that are compared, and the third.
+const NAMES: [&str; 3] = ["one", "other", "third"];
 /// Time for a run to start, and for a tick.
 const DEADLINE: Duration = Duration::from_secs(120);
 /// The processes whose work the ticks are. Each has one thread that works.
@@ -38,12 +41,14 @@ const MOST: f64 = 1.01;
 /// How much is measured.
 struct WatchSize {
     vehicles: u32,
-    /// Time for pairs of stretches.
+    /// Time for pairs of stretches; there is one at least with the recorder in each place.
     time: Duration,
     /// Ticks of a stretch.
     stretch: u64,
     /// Ticks at its beginning that are not measured, because a recorder comes or goes.
     settling: u64,
+    /// Most ticks by which the first or last look at a stretch may be late. A stretch that is looked at later is left out.
+    tolerance: u64,
 }
 
 const SIZE: WatchSize = WatchSize {
@@ -51,42 +56,72 @@ const SIZE: WatchSize = WatchSize {
     time: Duration::from_secs(60),
     stretch: 70,
     settling: 30,
+    tolerance: 1,
 };
 const QUICK: WatchSize = WatchSize {
     vehicles: 60,
     time: Duration::ZERO,
-    stretch: 3000,
-    settling: 1500,
+    stretch: 2400,
+    settling: 1200,
+    tolerance: 400,
 };
 
-impl WatchSize {
-    /// Most ticks by which the first or last look at a stretch may be late. A stretch that is looked at later is left out.
-    fn tolerance(&self) -> u64 {
-        self.stretch / 50
+/// Where the recorder is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum RecorderPlace {
+    /// Beside the run.
+    Here,
+    /// Beside the third run.
+    Elsewhere,
+    /// No recorder is there, which shows how far equal stretches differ.
+    Nowhere,
+}
+
+impl RecorderPlace {
+    const ALL: [Self; 3] = [Self::Here, Self::Elsewhere, Self::Nowhere];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Here => "watched",
+            Self::Elsewhere => "a recorder elsewhere",
+            Self::Nowhere => "alone beside alone",
+        }
     }
 }
 
-/// Which stretches of ticks are watched in which run. Two stretches in a row are a pair. In two of three pairs the one run is watched in the
-/// first stretch and the other run in the second; in the third neither is, which shows how far equal stretches differ.
+/// In which stretches of ticks which run has a recorder. Two stretches in a row are a pair: one run has its turn in the first, the other
+/// run in the second. Three pairs in a row have the recorder in each [`RecorderPlace`].
 #[derive(Debug, Clone, Copy)]
 struct WatchPlan {
     seed: u64,
 }
 
 impl WatchPlan {
-    /// True if a recorder is there in this pair of stretches.
-    fn has_recorder(pair: u64) -> bool {
-        pair % 3 != 2
+    fn place(pair: u64) -> RecorderPlace {
+        match pair % 3 {
+            0 => RecorderPlace::Here,
+            1 => RecorderPlace::Elsewhere,
+            _ => RecorderPlace::Nowhere,
+        }
     }
 
-    /// The run that is watched in the first stretch of a pair: at random.
+    /// The run that has its turn in the first stretch of a pair: at random, but the same for three pairs, so that a recorder has a stretch
+    /// to end before the run has its next.
     fn first_run(self, pair: u64) -> usize {
-        usize::from(fastrand::Rng::with_seed(self.seed.wrapping_add(pair)).bool())
+        usize::from(fastrand::Rng::with_seed(self.seed.wrapping_add(pair / 3)).bool())
     }
 
-    fn is_watched(self, run: usize, stretch: u64) -> bool {
+    /// Where the recorder of a run is in a stretch. The third run has none.
+    fn recorder(self, run: usize, stretch: u64) -> RecorderPlace {
         let pair = stretch / 2;
-        Self::has_recorder(pair) && (self.first_run(pair) == run) == stretch.is_multiple_of(2)
+        let turn = match stretch % 2 {
+            0 => self.first_run(pair),
+            _ => 1 - self.first_run(pair),
+        };
+        match run == turn {
+            true => Self::place(pair),
+            false => RecorderPlace::Nowhere,
+        }
     }
 }
 
@@ -102,7 +137,7 @@ const COSTS: [&str; 2 + LOOP.len()] = [
 /// What a run had paid at a moment, or pays for each tick of a stretch; seconds, by [`COSTS`].
 type Costs = [f64; COSTS.len()];
 
-/// Runs a generated city twice at once, and records the one or the other for some of the time.
+/// Runs a generated city three times at once, and records one of the runs for some of the time.
 ///
 /// # Errors
 /// A run cannot be started, or ends by itself.
@@ -118,12 +153,12 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let place = BenchDirectory::new("watch")?;
     let plan = WatchPlan { seed: options.seed };
     let cores = CorePlan::of_machine(NAMES.len() * LOOP.len(), OTHER_CORES)?;
-    let mut runs = RunPair::start(options, &size, &place, cores.as_ref())?;
+    let mut runs = LiveRuns::start(options, &size, &place, cores.as_ref())?;
     let begin = Instant::now();
     let mut ratios = PairRatios::default();
-    while ratios.watched.len() < 2 || ratios.alone.len() < 2 || begin.elapsed() < size.time {
+    while ratios.fewest() == 0 || begin.elapsed() < size.time {
         if runs.look(&size, plan)? {
-            ratios = PairRatios::of(plan, &runs.costs());
+            ratios = PairRatios::measured(plan, &runs.costs());
         }
         std::thread::park_timeout(POLL);
     }
@@ -149,34 +184,35 @@ fn report(
         "watch",
         "A recorder that watches",
         format!(
-            "{} vehicles on a generated city, `caraware simulate` at full speed without viewers, two equal runs side by side. Stretches of {} \
-             ticks are compared with the same ticks of the other run, without the first {}, in which a recorder comes or goes. In {} pairs of \
-             stretches `caraware record` is beside the one run and then beside the other, and a ratio is the geometric mean of both. \
-             `alone beside alone` is the same of {} pairs between them without a recorder. Intervals are those of the median, 95 % at least, \
-             from the order of the ratios alone. Processor time is that of `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorders \
-             received {message_mb_per_s:.0} MB/s and missed {:.0} ticks. At the end one run was {} ticks ahead, and the load of the machine \
-             was {load}.",
+            "{} vehicles on a generated city, `caraware simulate` at full speed without viewers, two equal runs and a third side by side. \
+             Stretches of {} ticks are compared with the same ticks of the other run, without the first {}, in which a recorder comes or goes. \
+             A pair of stretches has `caraware record` for the one run and then for the other, and a ratio is the geometric mean of both. In \
+             {} pairs it is beside that run; in {} pairs it is beside the third run, which costs what any such program costs; and {} pairs \
+             have none. Intervals are those of the median, 95 % at least, from the order of the ratios alone. Processor time is that of \
+             `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorders received {message_mb_per_s:.0} MB/s and missed {:.0} ticks. At \
+             the end one run was {} ticks ahead, and the load of the machine was {load}.",
             size.vehicles,
             size.stretch,
             size.settling,
-            ratios.watched.len(),
-            ratios.alone.len(),
+            ratios.of(RecorderPlace::Here).len(),
+            ratios.of(RecorderPlace::Elsewhere).len(),
+            ratios.of(RecorderPlace::Nowhere).len(),
             received.missed_ticks,
             received.ticks_apart,
         ),
     );
     let mut table = ReportTable::new("of alone", &["what", "median", "95 % interval"]);
     let mut watched_low = f64::NAN;
-    for (beside, ratios) in [("watched", &ratios.watched), ("alone beside alone", &ratios.alone)] {
+    for place in RecorderPlace::ALL {
         for (cost, name) in COSTS.into_iter().enumerate() {
-            let values: Vec<f64> = ratios.iter().map(|costs| costs[cost]).collect();
+            let values: Vec<f64> = ratios.of(place).iter().map(|costs| costs[cost]).collect();
             let Some(MedianInterval { median, low, high }) = MedianInterval::of(&values) else {
                 return Err(Exit::run("no stretch was measured", ""));
             };
-            if (cost, beside) == (0, "watched") {
+            if (cost, place) == (0, RecorderPlace::Here) {
                 watched_low = low;
             }
-            let name = format!("{name} of a tick, {beside}");
+            let name = format!("{name} of a tick, {}", place.name());
             table.row([name.clone(), format!("{median:.4}"), format!("{low:.4}–{high:.4}")]);
             for (part, value) in [("median", median), ("low", low), ("high", high)] {
                 report.figure(format!("{name}, {part}"), value);
@@ -201,18 +237,13 @@ fn report(
     Ok(report)
 }
 
-/// Ratios of the pairs that both runs have measured.
+/// Ratios of the pairs that both runs have measured: the run that has its turn to the other.
 #[derive(Debug, Default)]
-struct PairRatios {
-    /// A watched run to the other.
-    watched: Vec<Costs>,
-    /// The same of pairs without a recorder.
-    alone: Vec<Costs>,
-}
+struct PairRatios(BTreeMap<RecorderPlace, Vec<Costs>>);
 
 impl PairRatios {
     /// Ratios of the costs of both runs, by stretch.
-    fn of(plan: WatchPlan, costs: &[&BTreeMap<u64, Costs>; 2]) -> Self {
+    fn measured(plan: WatchPlan, costs: &[&BTreeMap<u64, Costs>; 2]) -> Self {
         let mut ratios = Self::default();
         let stretches = costs[0].keys().filter(|stretch| stretch.is_multiple_of(2));
         for pair in stretches.map(|stretch| stretch / 2) {
@@ -222,12 +253,22 @@ impl PairRatios {
                 continue;
             };
             let crossed = std::array::from_fn(|cost| (a[cost] / b[cost] * (c[cost] / d[cost])).sqrt());
-            match WatchPlan::has_recorder(pair) {
-                true => ratios.watched.push(crossed),
-                false => ratios.alone.push(crossed),
-            }
+            ratios.0.entry(WatchPlan::place(pair)).or_default().push(crossed);
         }
         ratios
+    }
+
+    fn of(&self, place: RecorderPlace) -> &[Costs] {
+        self.0.get(&place).map_or(&[], Vec::as_slice)
+    }
+
+    /// Pairs of the place that has the fewest.
+    fn fewest(&self) -> usize {
+        RecorderPlace::ALL
+            .map(|place| self.of(place).len())
+            .into_iter()
+            .min()
+            .unwrap_or(0)
     }
 }
 
@@ -264,7 +305,7 @@ impl MedianInterval {
 }
 
 /// The runs that are measured.
-struct RunPair {
+struct LiveRuns {
     caraware: PathBuf,
     place: PathBuf,
     runs: Vec<LiveRun>,
@@ -279,7 +320,7 @@ struct Received {
     ticks_apart: u64,
 }
 
-impl RunPair {
+impl LiveRuns {
     fn start(
         options: &BenchOptions,
         size: &WatchSize,
@@ -306,16 +347,16 @@ impl RunPair {
         Ok(pair)
     }
 
-    /// Looks at both runs, and lets recorders come and go. True if a stretch has been measured.
+    /// Looks at the runs, and lets recorders come and go. True if a stretch has been measured.
     fn look(&mut self, size: &WatchSize, plan: WatchPlan) -> Result<bool, Exit> {
         let mut is_measured = false;
         for (index, run) in self.runs.iter_mut().enumerate() {
-            is_measured |= run.look(size, |stretch| plan.is_watched(index, stretch))?;
+            is_measured |= run.look(size, |stretch| plan.recorder(index, stretch))?;
         }
         Ok(is_measured)
     }
 
-    /// What each run has paid for a tick of each stretch.
+    /// What each of the two runs has paid for a tick of each stretch.
     fn costs(&self) -> [&BTreeMap<u64, Costs>; 2] {
         [0, 1].map(|run: usize| &self.runs[run].costs)
     }
@@ -440,7 +481,7 @@ impl LiveRun {
     }
 
     /// Looks at the newest tick. Measures stretches, and starts and ends recorders where stretches begin. True if a stretch has been measured.
-    fn look(&mut self, size: &WatchSize, is_watched: impl Fn(u64) -> bool) -> Result<bool, Exit> {
+    fn look(&mut self, size: &WatchSize, recorder: impl Fn(u64) -> RecorderPlace) -> Result<bool, Exit> {
         let tick = self.tick();
         if tick == self.newest_tick.0 {
             self.check_alive()?;
@@ -448,7 +489,7 @@ impl LiveRun {
         }
         self.newest_tick = (tick, Instant::now());
         let (stretch, ticks_in) = (tick / size.stretch, tick % size.stretch);
-        let is_on_time = |from: u64| (from..=from + size.tolerance()).contains(&ticks_in);
+        let is_on_time = |from: u64| (from..=from + size.tolerance).contains(&ticks_in);
         let mut is_measured = false;
         if self.stretch != Some(stretch) {
             if let (Some(before), Some((first_tick, begin))) = (self.stretch, self.begun.take())
@@ -461,10 +502,11 @@ impl LiveRun {
                 is_measured = true;
             }
             self.stretch = Some(stretch);
-            match (self.recorder.is_some(), is_watched(stretch)) {
-                (false, true) => self.start_recorder()?,
-                (true, false) => self.ask_recorder_to_end(),
-                _ => {}
+            self.ask_recorder_to_end();
+            match recorder(stretch) {
+                RecorderPlace::Here => self.start_recorder(self.name)?,
+                RecorderPlace::Elsewhere => self.start_recorder(NAMES[2])?,
+                RecorderPlace::Nowhere => {}
             }
         } else if self.begun.is_none() && is_on_time(size.settling) {
             // Its first bytes are there once it has attached to the run.
@@ -492,10 +534,10 @@ impl LiveRun {
         self.place.join(format!("{}.mcap", self.name))
     }
 
-    fn start_recorder(&mut self) -> Result<(), Exit> {
+    fn start_recorder(&mut self, watched: &str) -> Result<(), Exit> {
         self.end_recorder()?;
         let recorder = command(&self.caraware, &self.place)
-            .args(["record", self.name, "--output"])
+            .args(["record", watched, "--output"])
             .arg(self.recording())
             .stdout(Stdio::piped())
             .spawn()
@@ -584,31 +626,31 @@ mod tests {
         assert_eq!(MedianInterval::of(&[]), None);
     }
 
-    /// Ticks differ in work, the second run has faster cores, both slow down, and watching costs 5 %.
+    /// Ticks differ in work, the second run has faster cores, watching costs 5 %, and a recorder elsewhere 2 %.
     #[test]
     fn neither_the_work_nor_the_cores_are_in_the_ratios() {
         let plan = WatchPlan { seed: 1 };
         let cost = |run: usize, stretch: u64| {
             let work = [3.0, 7.0, 2.0, 5.0][stretch as usize % 4];
             let cores = [1.6, 1.0][run];
-            let watching = if plan.is_watched(run, stretch) { 1.05 } else { 1.0 };
+            let watching = [1.05, 1.02, 1.0][plan.recorder(run, stretch) as usize];
             [work * cores * watching; COSTS.len()]
         };
-        let costs = [0, 1].map(|run: usize| (0..40).map(|stretch| (stretch, cost(run, stretch))).collect());
-        let ratios = PairRatios::of(plan, &costs.each_ref());
-        assert_eq!((ratios.watched.len(), ratios.alone.len()), (14, 6));
-        for (ratios, expected) in [(&ratios.watched, 1.05), (&ratios.alone, 1.0)] {
-            let values = ratios.as_flattened();
+        let costs = [0, 1].map(|run: usize| (0..42).map(|stretch| (stretch, cost(run, stretch))).collect());
+        let ratios = PairRatios::measured(plan, &costs.each_ref());
+        for (place, expected) in RecorderPlace::ALL.into_iter().zip([1.05, 1.02, 1.0]) {
+            let values = ratios.of(place).as_flattened();
+            assert_eq!(values.len(), 7 * COSTS.len());
             assert!(
                 values.iter().all(|ratio| (ratio - expected).abs() < 1e-12),
                 "{values:?}"
             );
         }
         // Either run is the first, and a pair that one run lacks gives nothing.
-        let firsts: Vec<usize> = (0..20).map(|pair| plan.first_run(pair)).collect();
+        let firsts: Vec<usize> = (0..21).map(|pair| plan.first_run(pair)).collect();
         assert!(firsts.contains(&0) && firsts.contains(&1), "{firsts:?}");
         let [whole, mut short]: [BTreeMap<u64, Costs>; 2] = costs;
         short.remove(&1);
-        assert_eq!(PairRatios::of(plan, &[&whole, &short]).watched.len(), 13);
+        assert_eq!(PairRatios::measured(plan, &[&whole, &short]).fewest(), 6);
     }
 }

@@ -43,15 +43,15 @@ fn an_unknown_part_is_refused_as_wrong_usage() {
     assert!(text.contains("possible values: lidar"), "{text}");
 }
 
-/// A recorder comes and goes beside two live runs, and every pair of stretches gives a ratio.
+/// A recorder comes and goes beside live runs, and every pair of stretches gives a ratio.
 #[test]
-fn a_recorder_that_watches_is_measured_beside_two_runs() {
+fn a_recorder_that_watches_is_measured_beside_equal_runs() {
     let file = tempfile::NamedTempFile::new().unwrap();
     let (code, text) = answer(&["watch", "--quick", "--json", file.path().to_str().unwrap()]);
     assert_eq!(code, Some(0), "{text}");
     let report: serde_json::Value = serde_json::from_reader(file).unwrap();
     for what in ["wall time", "processor time", "processor time of `traffic-bridge`"] {
-        for beside in ["watched", "alone beside alone"] {
+        for beside in ["watched", "a recorder elsewhere", "alone beside alone"] {
             let figure = |part: &str| {
                 report["figures"][format!("{what} of a tick, {beside}, {part}")]
                     .as_f64()
