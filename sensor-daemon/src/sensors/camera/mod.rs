@@ -268,9 +268,6 @@ impl CameraModel {
         surfaces.begin(planes.have_colours().then_some(sight.light));
         sight.bodies.gather(&view, list, surfaces);
         targets.gather(&view, carrier, list, surfaces);
-        if let Some(relief) = &sight.relief {
-            relief.gather(&view, list);
-        }
         list.sort();
         // Find the first surface of each pixel.
         canvas.room_for(&self.optics);
@@ -279,6 +276,9 @@ impl CameraModel {
             (1.0 / self.optics.range_m) as f32,
         );
         canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
+        if let Some(relief) = &sight.relief {
+            relief.draw::<S>(&view, canvas, list);
+        }
         // Write what that surface shows.
         motions.still = None;
         motions.users.clear();

@@ -304,6 +304,24 @@ impl Canvas {
         }
     }
 
+    /// Draws a polygon of the list with these edges.
+    #[inline(always)]
+    pub(super) fn item<S: Simd>(&mut self, item: &DrawItem, edges: &[LinearForm]) {
+        if let DrawShape::Polygon(inverse, [first, end]) = item.shape {
+            self.polygon::<S>(item, inverse, &edges[first as usize..end as usize]);
+        }
+    }
+
+    /// True if every pixel of these tiles already sees something whose inverse depth is `most` or more.
+    #[inline(always)]
+    pub(super) fn hides(&self, tiles: &TileRange, most: f32) -> bool {
+        let [columns, rows] = [tiles.x, tiles.y].map(|[first, last]| usize::from(first)..=usize::from(last));
+        rows.into_iter().all(|row| {
+            let least = &self.least[row * self.tiles[0]..][..self.tiles[0]];
+            least[columns.clone()].iter().all(|least| *least >= most)
+        })
+    }
+
     #[inline(always)]
     fn polygon<S: Simd>(&mut self, item: &DrawItem, inverse: LinearForm, edges: &[LinearForm]) {
         let [a_most, b_most] = self.most();

@@ -1,15 +1,15 @@
-//! Ground that is not flat: the triangles of the LIDAR's grid, gathered by blocks.
+//! Ground that is not flat: the triangles of the LIDAR's grid, drawn by blocks.
 
 use sim_core::scene::Scene;
 
 use super::{
-    raster::GROUND_SURFACE,
+    raster::{Canvas, GROUND_SURFACE},
     view::{BodyBounds, CameraView, DrawList, cross},
 };
-use crate::sensors::lidar::GroundGrid;
+use crate::sensors::lidar::{GroundGrid, simd::Simd};
 
 /// Cells of a block in a row and in a column.
-const BLOCK: usize = 8;
+const BLOCK: usize = 4;
 /// Corners of a block in a row and in a column.
 const CORNERS: usize = BLOCK + 1;
 
@@ -51,9 +51,10 @@ impl Relief {
         Some(Self { grid, columns, blocks })
     }
 
-    /// Adds the ground that a camera may see.
+    /// Draws the ground that a camera sees, after all other surfaces and nearest first: most of it lies behind them, and the triangles of
+    /// a hidden block are not looked at. `list` is overwritten.
     #[inline(always)]
-    pub(super) fn gather(&self, view: &CameraView<'_>, list: &mut DrawList) {
+    pub(super) fn draw<S: Simd>(&self, view: &CameraView<'_>, canvas: &mut Canvas, list: &mut DrawList) {
         let reach = view.optics.reach_m / (self.grid.cell_m * BLOCK as f64);
         let rows = self.blocks.len() / self.columns;
         let span = |axis: usize, count: usize| {
@@ -61,11 +62,34 @@ impl Relief {
             let low = (at - reach).max(0.0) as usize;
             low..((at + reach).max(-1.0) as isize + 1).clamp(0, count as isize) as usize
         };
+        list.clear();
         for row in span(1, rows) {
             for column in span(0, self.columns) {
-                if view.may_see(&self.blocks[row * self.columns + column]) {
-                    self.block(view, [column * BLOCK, row * BLOCK], list);
+                let block = row * self.columns + column;
+                if view.may_see(&self.blocks[block])
+                    && let Some((tiles, most)) = view.bounds_tiles(&self.blocks[block])
+                {
+                    list.blocks.push((tiles, most, block as u32));
                 }
+            }
+        }
+        let DrawList { blocks, order, .. } = list;
+        order.clear();
+        // The bits of positive floats are in the order of the floats.
+        let keys = (0_u64..).zip(blocks.iter());
+        order.extend(keys.map(|(number, (_, most, _))| u64::from(!most.to_bits()) << 32 | number));
+        order.sort_unstable();
+        for place in 0..list.order.len() {
+            let (tiles, most, block) = list.blocks[list.order[place] as u32 as usize];
+            if canvas.hides(&tiles, most) {
+                continue;
+            }
+            list.items.clear();
+            list.edges.clear();
+            let block = block as usize;
+            self.block(view, [block % self.columns * BLOCK, block / self.columns * BLOCK], list);
+            for item in &list.items {
+                canvas.item::<S>(item, &list.edges);
             }
         }
     }

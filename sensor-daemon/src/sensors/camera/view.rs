@@ -25,6 +25,8 @@ pub(super) struct DrawList {
     pub(super) edges: Vec<LinearForm>,
     pub(super) cylinders: Vec<Cylinder>,
     pub(super) order: Vec<u64>,
+    /// Blocks of hilly ground: their tiles, an upper bound of their inverse depth, and their number.
+    pub(super) blocks: Vec<(TileRange, f32, u32)>,
 }
 
 /// An upright cylinder about a body, in the world.
@@ -169,15 +171,22 @@ impl CameraView<'_> {
         });
     }
 
-    /// Adds an upright cylinder.
-    pub(super) fn cylinder(&self, list: &mut DrawList, body: &BodyBounds, surface: u32) {
+    /// The tiles that a body within these bounds may cover, and an upper bound of its inverse depth; `None` if it is not in the image.
+    #[inline(always)]
+    pub(super) fn bounds_tiles(&self, body: &BodyBounds) -> Option<(TileRange, f32)> {
         let [[x0, y0], reach_m] = [body.centre_m, [body.radius_m; 2]];
         let square = [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]];
         let mut corners = [[0.0; 3]; 8];
         for (pair, [sx, sy]) in corners.chunks_exact_mut(2).zip(square) {
             pair.copy_from_slice(&self.upright([x0 + sx * reach_m[0], y0 + sy * reach_m[1]], body.z_m));
         }
-        let Some((tiles, most)) = self.tiles(&corners) else {
+        self.tiles(&corners)
+    }
+
+    /// Adds an upright cylinder.
+    pub(super) fn cylinder(&self, list: &mut DrawList, body: &BodyBounds, surface: u32) {
+        let [x0, y0] = body.centre_m;
+        let Some((tiles, most)) = self.bounds_tiles(body) else {
             return;
         };
         let o = &self.pose.position_m;
@@ -206,6 +215,7 @@ impl DrawList {
         self.items.clear();
         self.edges.clear();
         self.cylinders.clear();
+        self.blocks.clear();
     }
 
     /// Sorts the surfaces, nearest first.
