@@ -9,10 +9,6 @@ use clap::{Parser, ValueEnum};
 pub enum BenchPart {
     /// LIDAR: rays per second on one core, compared with Open3D's ray caster (Embree) on the same scene and rays
     Lidar,
-    /// Cameras: images per second on one core, compared with Open3D's ray caster and MuJoCo's software renderer on the same boxes
-    Camera,
-    /// Radars: scans per second on one core
-    Radar,
     /// Environments: vehicle-steps per second of 1, 2 and 4 environments, compared with one on a single core
     Envs,
     /// Fan-out: lateness and rate of a run with eight viewers (one stopped, one slow), compared with the run alone; kills of the fan-out
@@ -27,6 +23,10 @@ pub enum BenchPart {
     Scale,
     /// Vehicle-steps per second, compared with Python loops over TraCI and libsumo, with MetaDrive and with SMARTS
     Peers,
+    /// Cameras: images per second on one core, compared with Open3D's ray caster and MuJoCo's software renderer on the same boxes
+    Camera,
+    /// Radars: scans per second on one core
+    Radar,
     /// Messages: delivery over distance, channel load, awareness over the share of radios, age, redundancy, sizes, error after fusion
     #[value(name = "v2x")]
     V2x,

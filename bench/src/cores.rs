@@ -11,7 +11,7 @@ use rustix::{
 /// Cores for compared processes, and cores for all else. The processors of a core share it, so a compared process has the first and the
 /// others stay idle.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CorePlan {
+pub struct BenchCores {
     /// The processor of each compared process.
     own: Vec<usize>,
     /// Processors of all else.
@@ -20,7 +20,7 @@ pub struct CorePlan {
     all: Vec<usize>,
 }
 
-impl CorePlan {
+impl BenchCores {
     /// A plan for this machine: `own` cores for one process each, and `others` cores at least; `None` if it has fewer.
     ///
     /// # Errors
@@ -103,13 +103,13 @@ mod tests {
         // Two processors on each core, numbered one core after the other, and then in two rounds.
         for cores in [[0, 0, 1, 1, 2, 2, 3, 3], [0, 1, 2, 3, 0, 1, 2, 3]] {
             let cpus = cores.into_iter().map(|core: usize| core.to_string()).enumerate();
-            let plan = CorePlan::of(cpus.clone(), 3, 1).unwrap();
+            let plan = BenchCores::of(cpus.clone(), 3, 1).unwrap();
             let core_of = |cpu: &usize| cores[*cpu];
             assert_eq!(plan.own.iter().map(core_of).collect::<Vec<_>>(), [0, 1, 2]);
             assert_eq!(plan.others.iter().map(core_of).collect::<Vec<_>>(), [3, 3]);
             assert_eq!(plan.all.len(), 8);
-            assert_eq!(CorePlan::of(cpus, 3, 2), None, "four cores are too few");
+            assert_eq!(BenchCores::of(cpus, 3, 2), None, "four cores are too few");
         }
-        assert_eq!(CorePlan::of(std::iter::empty(), 1, 0), None);
+        assert_eq!(BenchCores::of(std::iter::empty(), 1, 0), None);
     }
 }

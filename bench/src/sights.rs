@@ -75,21 +75,23 @@ pub fn camera(options: &BenchOptions) -> Result<BenchReport, Exit> {
             .to_owned(),
     );
     let size = |[width, height]: [u32; 2]| format!("{width} × {height}");
-    let mut ours = ReportTable::new("", &["instructions", "image", "scene", "planes", "images/s"]);
-    for row in &measured.rows {
-        let rate = format!("{:.0}", row.images_per_s);
-        report.figure(
-            format!("{}, {}, {}, {}", row.path, size(row.size), row.ground, row.planes),
-            row.images_per_s,
-        );
-        ours.row([
-            row.path.clone(),
-            size(row.size),
-            row.ground.clone(),
-            row.planes.clone(),
-            rate,
-        ]);
+    let mut planes: Vec<&str> = Vec::new();
+    let mut rows: Vec<Vec<String>> = Vec::new();
+    for rate in &measured.rows {
+        if !planes.contains(&rate.planes.as_str()) {
+            planes.push(&rate.planes);
+        }
+        let case = [rate.path.clone(), size(rate.size), rate.ground.clone()];
+        report.figure(format!("{}, {}", case.join(", "), rate.planes), rate.images_per_s);
+        let number = format!("{:.0}", rate.images_per_s);
+        match rows.iter_mut().find(|row| row.starts_with(&case)) {
+            Some(row) => row.push(number),
+            None => rows.push(case.into_iter().chain([number]).collect()),
+        }
     }
+    let heads: Vec<&str> = ["instructions", "image", "scene"].into_iter().chain(planes).collect();
+    let mut ours = ReportTable::new("images/s", &heads);
+    ours.rows = rows;
     report.tables.push(ours);
     let mut peers = ReportTable::new(
         "",

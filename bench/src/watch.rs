@@ -20,7 +20,7 @@ use caraware::{failure::Exit, generate::GeneratedCity, install, install::Install
 use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal};
 
-use super::{BenchOptions, BenchReport, ReportTable, cores::CorePlan, sides::BenchDirectory};
+use super::{BenchOptions, BenchReport, ReportTable, cores::BenchCores, sides::BenchDirectory};
 use crate::target::signal;
 
 /// Names of the runs: the two that are compared, and the third.
@@ -152,7 +152,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     };
     let place = BenchDirectory::new("watch")?;
     let plan = WatchPlan { seed: options.seed };
-    let cores = CorePlan::of_machine(NAMES.len() * LOOP.len(), OTHER_CORES)?;
+    let cores = BenchCores::of_machine(NAMES.len() * LOOP.len(), OTHER_CORES)?;
     let mut runs = LiveRuns::start(options, &size, &place, cores.as_ref())?;
     let begin = Instant::now();
     let mut ratios = PairRatios::default();
@@ -325,7 +325,7 @@ impl LiveRuns {
         options: &BenchOptions,
         size: &WatchSize,
         place: &BenchDirectory,
-        cores: Option<&CorePlan>,
+        cores: Option<&BenchCores>,
     ) -> Result<Self, Exit> {
         let city = GeneratedCity::of(size.vehicles, CITY_S, 0.1, 1);
         let sumocfg = city.write(&Install::find()?, &place.path().join("city"))?;
@@ -335,7 +335,7 @@ impl LiveRuns {
             runs: Vec::new(),
         };
         // What is started from here on is not on the cores of the loops.
-        cores.map_or(Ok(()), CorePlan::keep_off)?;
+        cores.map_or(Ok(()), BenchCores::keep_off)?;
         for (index, name) in NAMES.into_iter().enumerate() {
             let run = LiveRun::start(&pair.caraware, &pair.place, name, &sumocfg)?;
             if let Some(cores) = cores {

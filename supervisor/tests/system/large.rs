@@ -56,6 +56,21 @@ fn every_peer_has_its_ratio_or_the_reason_why_not() {
 }
 
 #[test]
+fn cameras_and_radars_have_their_rates() {
+    let workplace = Workplace::new();
+    for (part, cases) in [("camera", 30), ("radar", 9)] {
+        let file = format!("{part}.json");
+        workplace.succeed(&["bench", part, "--quick", "--json", &file]);
+        let text = std::fs::read_to_string(workplace.path().join(file)).unwrap();
+        let report: Value = serde_json::from_str(&text).unwrap();
+        let figures = report["figures"].as_object().unwrap();
+        assert_eq!(figures.len(), cases, "{report:#}");
+        assert!(figures.values().all(|rate| rate.as_f64().unwrap() > 1.0), "{report:#}");
+    }
+    workplace.assert_nothing_left();
+}
+
+#[test]
 fn neither_the_window_nor_a_consumer_changes_observations_at_long_steps() {
     let workplace = Workplace::new();
     let city = ["--vehicles", "60", "--duration-s", "12", "--step-s", "1"];

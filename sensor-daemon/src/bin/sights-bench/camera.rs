@@ -13,6 +13,7 @@ use sensor_daemon::sensors::{
 use sim_core::scene::Scene;
 
 use crate::{
+    BenchSize,
     city::Ground,
     lidar_city::{self, oracle},
     now_s,
@@ -21,8 +22,6 @@ use crate::{
 
 /// The first vehicles carry a camera.
 const CAMERAS: usize = 16;
-const ROUNDS: usize = 7;
-const TICKS: u64 = 20;
 /// Pairs with each peer.
 const PAIRS: usize = 5;
 const RANGE_M: f64 = 150.0;
@@ -47,7 +46,7 @@ enum Shows {
 const SUB_STEPS: usize = 10;
 
 /// Images per second: the median of the rounds.
-fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, rounds: usize) -> f64 {
+fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, size: &BenchSize) -> f64 {
     let [width, height] = camera.size();
     let pixels = width * height;
     let wants = |kinds: &[Shows]| if kinds.contains(&shows) { pixels } else { 0 };
@@ -61,12 +60,12 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, r
     let mut memories = vec![EventMemory::default(); CAMERAS];
     let (mut scratch, mut objects) = (CameraScratch::default(), Vec::new());
     let (mut targets, mut seen) = (Targets::default(), CameraTargets::default());
-    let mut rates: Vec<f64> = (0..rounds)
+    let mut rates: Vec<f64> = (0..size.rounds)
         .map(|round| {
             // A tick of events is ten images.
-            let count = if shows == Shows::Events { TICKS / 5 } else { TICKS };
+            let count = size.ticks.div_ceil(if shows == Shows::Events { 5 } else { 1 });
             let ticks: Vec<_> = (0..count)
-                .map(|tick| ground.traffic(scene, CAMERAS, round as u64 * TICKS + tick))
+                .map(|tick| ground.traffic(scene, CAMERAS, round as u64 * size.ticks + tick))
                 .collect();
             let since_s = now_s();
             let mut images = 0;
@@ -120,7 +119,7 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, r
         })
         .collect();
     rates.sort_by(f64::total_cmp);
-    rates[rounds / 2]
+    rates[size.rounds / 2]
 }
 
 impl Shows {
@@ -149,13 +148,20 @@ fn camera([width, height]: [usize; 2], scene: &Scene) -> CameraModel {
     CameraModel::new(&params, &config(), scene)
 }
 
+fn name_of(path: ScanPath) -> &'static str {
+    match path {
+        ScanPath::Avx512 => "AVX-512",
+        ScanPath::Avx2 => "AVX2",
+        ScanPath::Plain => "plain",
+    }
+}
+
 fn config() -> Config {
     lidar_city::config()
 }
 
 /// Images per second of every instruction set, size, ground and selection of planes; with peers if `python` has them.
-pub fn measure(python: Option<&Path>, is_quick: bool) -> serde_json::Value {
-    let rounds = if is_quick { 1 } else { ROUNDS };
+pub fn measure(python: Option<&Path>, bench: &BenchSize) -> serde_json::Value {
     let mut rows = Vec::new();
     for ground in Ground::ALL {
         let scene = ground.scene();
@@ -163,17 +169,18 @@ pub fn measure(python: Option<&Path>, is_quick: bool) -> serde_json::Value {
             for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
                 let camera = camera(size, &scene).with_path(path);
                 for shows in Shows::ALL {
-                    let rate = rate(&camera, (ground, &scene), shows, rounds);
+                    let rate = rate(&camera, (ground, &scene), shows, bench);
                     println!(
-                        "{path:?} {size:?} {} {}: {rate:.0} images/s",
+                        "{} {size:?} {} {}: {rate:.0} images/s",
+                        name_of(path),
                         ground.name(),
                         shows.name()
                     );
                     rows.push(serde_json::json!({
-                        "path": format!("{path:?}"), "size": size, "ground": ground.name(), "planes": shows.name(), "images_per_s": rate,
+                        "path": name_of(path), "size": size, "ground": ground.name(), "planes": shows.name(), "images_per_s": rate,
                     }));
                 }
-                if is_quick {
+                if bench.is_quick() {
                     break;
                 }
             }

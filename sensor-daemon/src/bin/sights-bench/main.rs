@@ -21,6 +21,23 @@ mod lidar_city;
 mod peers;
 mod radar;
 
+/// How much is measured.
+struct BenchSize {
+    /// The median of these counts.
+    rounds: usize,
+    ticks: u64,
+}
+
+impl BenchSize {
+    const FULL: Self = Self { rounds: 7, ticks: 20 };
+    const QUICK: Self = Self { rounds: 1, ticks: 2 };
+
+    /// True if only the fastest instructions are measured, and too little of them.
+    fn is_quick(&self) -> bool {
+        self.rounds == Self::QUICK.rounds
+    }
+}
+
 /// Processor time of this thread, seconds.
 fn now_s() -> f64 {
     ipc_schema::clock::seconds(rustix::time::ClockId::ThreadCPUTime)
@@ -29,19 +46,19 @@ fn now_s() -> f64 {
 fn main() {
     let mut arguments = std::env::args().skip(1);
     let part = arguments.next();
-    let (mut python, mut json, mut is_quick) = (None::<PathBuf>, None::<PathBuf>, false);
+    let (mut python, mut json, mut size) = (None::<PathBuf>, None::<PathBuf>, BenchSize::FULL);
     while let Some(argument) = arguments.next() {
         let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
         match argument.as_str() {
             "--python" => python = Some(value().into()),
             "--json" => json = Some(value().into()),
-            "--quick" => is_quick = true,
+            "--quick" => size = BenchSize::QUICK,
             other => panic!("unknown option {other}"),
         }
     }
     let report = match part.as_deref() {
-        Some("camera") => camera::measure(python.as_deref(), is_quick),
-        Some("radar") => radar::measure(is_quick),
+        Some("camera") => camera::measure(python.as_deref(), &size),
+        Some("radar") => radar::measure(&size),
         other => panic!("{other:?} is neither camera nor radar"),
     };
     if let Some(file) = json {

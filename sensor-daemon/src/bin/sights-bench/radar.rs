@@ -7,12 +7,10 @@ use sensor_daemon::sensors::{
     radar::{RadarModel, RadarScratch},
 };
 
-use crate::{city::Ground, lidar_city, now_s};
+use crate::{BenchSize, city::Ground, lidar_city, now_s};
 
 /// The first vehicles carry a radar.
 const RADARS: usize = 16;
-const ROUNDS: usize = 7;
-const TICKS: u64 = 20;
 
 /// A radar: its name, and what is set beside the defaults, which are those of a long-range radar.
 type NamedRadar = (&'static str, fn(&mut Config));
@@ -28,8 +26,7 @@ const UNITS: [NamedRadar; 3] = [
 ];
 
 /// Scans per second of every unit and ground, and how many detections a scan has.
-pub fn measure(is_quick: bool) -> serde_json::Value {
-    let rounds = if is_quick { 1 } else { ROUNDS };
+pub fn measure(bench: &BenchSize) -> serde_json::Value {
     let mut rows = Vec::new();
     for ground in Ground::ALL {
         let scene = ground.scene();
@@ -40,10 +37,10 @@ pub fn measure(is_quick: bool) -> serde_json::Value {
             let radar = RadarModel::new(&config, &scene);
             let (mut targets, mut seen) = (Targets::default(), CameraTargets::default());
             let (mut scratch, mut found) = (RadarScratch::default(), 0);
-            let mut rates: Vec<f64> = (0..rounds as u64)
+            let mut rates: Vec<f64> = (0..bench.rounds as u64)
                 .map(|round| {
-                    let ticks: Vec<_> = (0..TICKS)
-                        .map(|tick| ground.traffic(&scene, RADARS, round * TICKS + tick).0)
+                    let ticks: Vec<_> = (0..bench.ticks)
+                        .map(|tick| ground.traffic(&scene, RADARS, round * bench.ticks + tick).0)
                         .collect();
                     let since_s = now_s();
                     for (tick, states) in (0..).zip(&ticks) {
@@ -55,12 +52,12 @@ pub fn measure(is_quick: bool) -> serde_json::Value {
                             found += detections.len();
                         }
                     }
-                    (RADARS as u64 * TICKS) as f64 / (now_s() - since_s)
+                    (RADARS as u64 * bench.ticks) as f64 / (now_s() - since_s)
                 })
                 .collect();
             rates.sort_by(f64::total_cmp);
-            let rate = rates[rounds / 2];
-            let detections = found as f64 / (rounds * RADARS * TICKS as usize) as f64;
+            let rate = rates[bench.rounds / 2];
+            let detections = found as f64 / (bench.rounds * RADARS * bench.ticks as usize) as f64;
             println!(
                 "{} {unit}: {rate:.0} scans/s, {detections:.1} detections in each",
                 ground.name()
