@@ -80,6 +80,8 @@ pub enum NoiseStream {
     Ultrasonic = 6,
     /// Radar: the key of a scan, and its cells.
     Radar = 7,
+    /// Camera: the key of an image, and its pixels.
+    Camera = 8,
     /// GNSS receiver, correlated noise: east, north, up.
     GnssCorrelated = 32,
     /// IMU, walk of the biases of the accelerometer and of x of the gyroscope.
@@ -281,7 +283,7 @@ pub const SENSORS: [SensorSpec; 7] = [
         label: "camera",
         description: "Camera",
         carriers: SensorCarriers::Vehicles,
-        noise: &[],
+        noise: &[NoiseStream::Camera],
         blackout_noise: NoiseStream::CameraBlackout,
         vehicles: |config| config.camera.vehicles,
         input: SensorInput::Surroundings,
@@ -291,8 +293,7 @@ pub const SENSORS: [SensorSpec; 7] = [
         },
         period_s: |config| config.camera.period_s,
         blackouts: blackouts!(camera),
-        // A curriculum leaves its errors as they are.
-        scale_noise: |_, _| (),
+        scale_noise: |config, factor| config.camera.scale_noise(factor),
         scale_blackouts: scale_blackouts!(camera),
     },
     SensorSpec {
@@ -485,7 +486,7 @@ mod tests {
         assert_eq!(
             numbers,
             [
-                1, 2, 3, 4, 5, 6, 7, 32, 33, 34, 35, 36, 37, 38, 40, 41, 42, 43, 44, 45, 46
+                1, 2, 3, 4, 5, 6, 7, 8, 32, 33, 34, 35, 36, 37, 38, 40, 41, 42, 43, 44, 45, 46
             ]
         );
         // A stream has the low eight bits of a word, a part of a sample the others.

@@ -26,8 +26,8 @@ use crate::{
     sensing::Sensing,
     sensors::{
         camera::{
-            CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, EventMemory, ImagePlanes,
-            PastPoses, SampledSpan, SightScene, sort_events,
+            CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, EventMemory, ImageNoise,
+            ImagePlanes, PastPoses, PixelNoise, SampledSpan, SightScene, sort_events,
         },
         lidar::Targets,
     },
@@ -83,6 +83,8 @@ struct NumberedCamera {
     range_m: f32,
     distortion: [f32; 5],
     plane_bytes: usize,
+    noise: PixelNoise,
+    noise_key: u64,
     /// Ticks since which the optical flow counts; 0 without it.
     flow_ticks: u64,
     /// Change of brightness that is an event, and most events of an image; `None` without events.
@@ -189,6 +191,7 @@ impl EventVision {
                 return;
             };
             let shot = CameraShot {
+                noise: None,
                 targets: within,
                 carrier: Some(unit.row),
                 pose,
@@ -286,6 +289,12 @@ impl CameraImaging {
                 range_m: camera.range_m as f32,
                 distortion: camera.distortion.map(|part| part as f32),
                 plane_bytes: ImagePlane::bytes(&camera),
+                noise: PixelNoise {
+                    full_well_e: camera.full_well_e as f32,
+                    read_noise_e: camera.read_noise_e as f32,
+                    infrared_k: camera.infrared_noise_k as f32,
+                },
+                noise_key: unit.noise_key(),
                 flow_ticks: if camera.flow { u64::from(unit.period_ticks) } else { 0 },
                 events: camera
                     .events
@@ -399,6 +408,12 @@ impl CameraImaging {
         let mut planes_of = split_planes(planes, numbered.planes, width * height);
         let (seen, scratch) = (&self.seen, &mut self.scratch);
         let shot = CameraShot {
+            noise: ImageNoise::new(
+                numbered.noise,
+                header.episode_seed ^ numbered.noise_key,
+                carrier.id_hash,
+                header.tick,
+            ),
             targets: seen,
             carrier: Some(unit.row),
             pose,

@@ -44,6 +44,12 @@ pub struct CameraConfig {
     pub events: bool,
     /// Change of the logarithm of the brightness of a pixel that is an event.
     pub event_threshold: f64,
+    /// Electrons of a pixel as bright as can be shown, whose number is random (shot noise); 0 = colours have no noise.
+    pub full_well_e: f64,
+    /// Standard deviation of the noise of reading a pixel, electrons.
+    pub read_noise_e: f64,
+    /// Standard deviation of the noise of apparent temperatures, kelvin.
+    pub infrared_noise_k: f64,
     /// The plane that observations have of each image.
     pub observed: ObservedPlane,
     /// Length of a blackout, shortest and longest, seconds; [0, 0] = none.
@@ -81,6 +87,18 @@ impl ObservedPlane {
 }
 
 impl CameraConfig {
+    /// Noise times `factor`: shot noise falls with the square root of the electrons.
+    pub(crate) fn scale_noise(&mut self, factor: f64) {
+        if factor > 0.0 {
+            self.full_well_e /= factor * factor;
+            // Of a pixel's full scale, as the electrons become fewer or more.
+            self.read_noise_e /= factor;
+        } else {
+            self.full_well_e = 0.0;
+        }
+        self.infrared_noise_k *= factor;
+    }
+
     /// Bytes of the image of one slot in an observation.
     #[must_use]
     pub fn observed_bytes(&self) -> usize {

@@ -10,8 +10,8 @@ use ipc_schema::{
 };
 use sensor_daemon::sensors::{
     camera::{
-        CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, ImagePlanes, PastPoses,
-        SeenObject,
+        CameraModel, CameraParams, CameraPose, CameraScratch, CameraShot, CameraTargets, ImageNoise, ImagePlanes,
+        PastPoses, SeenObject,
     },
     lidar::Targets,
 };
@@ -22,6 +22,7 @@ mod closed_form;
 mod flow;
 #[path = "../lidar_city/mod.rs"]
 mod lidar_city;
+mod noise;
 mod oracle;
 mod paths;
 
@@ -59,12 +60,28 @@ fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut
     take_since(camera, None, states, row, scratch)
 }
 
+/// Takes an image from the road user in `row`, with noise.
+fn take_noisy(camera: &CameraModel, states: &[VehicleState], row: usize, noise: Option<ImageNoise>) -> Taken {
+    take_with(camera, None, states, row, noise, &mut CameraScratch::default()).0
+}
+
 /// Takes an image from the road user in `row`, with the optical flow since `before`.
 fn take_since(
     camera: &CameraModel,
     before: Option<&[VehicleState]>,
     states: &[VehicleState],
     row: usize,
+    scratch: &mut CameraScratch,
+) -> (Taken, CameraPose) {
+    take_with(camera, before, states, row, None, scratch)
+}
+
+fn take_with(
+    camera: &CameraModel,
+    before: Option<&[VehicleState]>,
+    states: &[VehicleState],
+    row: usize,
+    noise: Option<ImageNoise>,
     scratch: &mut CameraScratch,
 ) -> (Taken, CameraPose) {
     let mut poses = PastPoses::default();
@@ -104,6 +121,7 @@ fn take_since(
         brightness: &mut taken.brightness,
     };
     let shot = CameraShot {
+        noise,
         targets: &seen,
         carrier: Some(row),
         pose,

@@ -94,6 +94,7 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, s
                             ..ImagePlanes::default()
                         };
                         let shot = CameraShot {
+                            noise: None,
                             targets: &seen,
                             carrier: Some(row),
                             pose: pose.unwrap(),
@@ -297,6 +298,7 @@ impl StillScene {
             for row in 0..CAMERAS {
                 let since_s = now_s();
                 let shot = CameraShot {
+                    noise: None,
                     targets: &self.seen,
                     carrier: Some(row),
                     pose: self.camera.pose_on(&self.targets, row).unwrap(),

@@ -16,6 +16,7 @@ mod flow;
 mod ground;
 mod labels;
 mod light;
+mod noise;
 mod optics;
 mod raster;
 mod relief;
@@ -29,6 +30,7 @@ pub use events::{EventMemory, SampledSpan, sort_events};
 pub use flow::PastPoses;
 pub use ipc_schema::image::{SKY_INSTANCE, SeenObject};
 pub use labels::SemanticLabel;
+pub use noise::{ImageNoise, PixelNoise};
 pub use optics::CameraParams;
 pub use resolve::ImagePlanes;
 
@@ -102,6 +104,8 @@ pub struct CameraShot<'a> {
     pub pose: CameraPose,
     /// Camera and road users at the time since which the optical flow counts; without it there is no flow.
     pub past: Option<(CameraPose, &'a PastPoses)>,
+    /// Noise of the colours and of the apparent temperatures.
+    pub noise: Option<ImageNoise>,
 }
 
 /// Position and attitude of a camera in the world.
@@ -300,6 +304,7 @@ impl CameraModel {
             ground_colours: &sight.ground_colours,
             thermal: &sight.thermal,
             motions,
+            noise: shot.noise,
         };
         resolver.write::<S>(planes, counts);
         objects.clear();

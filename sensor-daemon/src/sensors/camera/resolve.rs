@@ -5,6 +5,7 @@ use super::{
     ground::GroundMap,
     labels::SemanticLabel,
     light::Daylight,
+    noise::ImageNoise,
     raster::{Canvas, GROUND_SURFACE, LinearForm, SKY_SURFACE},
     surfaces::{NO_USER, SurfaceTable},
     thermal::ThermalLight,
@@ -74,6 +75,7 @@ pub(super) struct Resolver<'a> {
     pub(super) ground_colours: &'a [[f32; 3]; 256],
     pub(super) thermal: &'a ThermalLight,
     pub(super) motions: &'a ImageMotions,
+    pub(super) noise: Option<ImageNoise>,
 }
 
 /// The motion of all that an image shows since an earlier time; `None` of what was not there.
@@ -113,6 +115,8 @@ struct Pixels {
     label: [u8; WIDTH],
     /// Share of the light that reaches the camera.
     clear: Floats,
+    /// Their place on the canvas.
+    place: usize,
 }
 
 impl Resolver<'_> {
@@ -167,6 +171,7 @@ impl Resolver<'_> {
             is_uniform: false,
             label: [SemanticLabel::Terrain as u8; WIDTH],
             clear: Floats::ZERO,
+            place,
         };
         S::store(depth, &mut pixels.depth);
         let surface = S::load_words(&pixels.surface);
@@ -286,6 +291,10 @@ impl Resolver<'_> {
         let green = S::splat(sky[1]) + clear * (S::load(&parts[1]) - S::splat(sky[1]));
         let blue = S::splat(sky[2]) + clear * (S::load(&parts[2]) - S::splat(sky[2]));
         if let Some(rgb) = planes.rgb.get_mut(at..at + count) {
+            let [red, green, blue] = match &self.noise {
+                Some(noise) => noise.colours::<S>(pixels.place, [red, green, blue]),
+                None => [red, green, blue],
+            };
             let (green, blue) = (S::left::<8>(byte::<S>(green)), S::left::<16>(byte::<S>(blue)));
             let mut words = Words::ZERO;
             S::store_words(S::or(S::or(byte::<S>(red), green), blue), &mut words);
@@ -309,9 +318,13 @@ impl Resolver<'_> {
         let mut clear = Floats::ZERO;
         let depths = S::load(&pixels.depth) * S::splat(self.thermal.extinction_per_m);
         S::store(crate::sensors::lidar::exp_minus::<S>(depths), &mut clear);
+        let mut errors = Floats::ZERO;
+        if let Some(noise) = &self.noise {
+            S::store(noise.temperatures::<S>(pixels.place), &mut errors);
+        }
         for (element, to) in infrared.iter_mut().enumerate() {
             let radiance = self.thermal.of(self.label(pixels, element));
-            *to = self.thermal.pixel(radiance, clear.0[element]);
+            *to = self.thermal.pixel(radiance, clear.0[element], errors.0[element]);
         }
     }
 

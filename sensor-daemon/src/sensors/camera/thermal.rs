@@ -91,15 +91,15 @@ impl ThermalLight {
         self.by_label[usize::from(label)]
     }
 
-    /// A pixel, hundredths of a kelvin, of a surface of which the share `clear` of the light arrives.
+    /// A pixel, hundredths of a kelvin, of a surface of which the share `clear` of the light arrives, read with an `error`.
     #[inline(always)]
-    pub(super) fn pixel(&self, surface: f32, clear: f32) -> u16 {
+    pub(super) fn pixel(&self, surface: f32, clear: f32, error: f32) -> u16 {
         let radiance = self.air + clear * (surface - self.air);
         let place = ((radiance - self.least) * self.steps_per_unit).clamp(0.0, STEPS as f32);
         let step = (place as usize).min(STEPS - 1);
         let [low, high] = [self.kelvin[step], self.kelvin[step + 1]];
         let kelvin = low + (place - step as f32) * (high - low);
-        (kelvin * 100.0 + 0.5) as u16
+        (kelvin * 100.0 + error + 0.5) as u16
     }
 }
 
@@ -206,14 +206,14 @@ mod tests {
     fn a_black_body_shows_its_own_temperature() {
         let light = ThermalLight::new(&weather(1e6));
         for temperature_k in [200.0, 273.15, 300.0, 306.15, 400.0] {
-            let pixel = f64::from(light.pixel(black_body(temperature_k) as f32, 1.0));
+            let pixel = f64::from(light.pixel(black_body(temperature_k) as f32, 1.0, 0.0));
             assert!((pixel / 100.0 - temperature_k).abs() < 0.03, "{temperature_k} {pixel}");
         }
         // Nothing of it arrives: the air's.
-        assert_eq!(light.pixel(black_body(400.0) as f32, 0.0), 28_815);
+        assert_eq!(light.pixel(black_body(400.0) as f32, 0.0, 0.0), 28_815);
         // Beyond the range: its end, and no wrap.
-        assert_eq!(light.pixel(1e9, 1.0), 45_000);
-        assert_eq!(light.pixel(-1.0, 1.0), 15_000);
+        assert_eq!(light.pixel(1e9, 1.0, 0.0), 45_000);
+        assert_eq!(light.pixel(-1.0, 1.0, 0.0), 15_000);
     }
 
     #[test]

@@ -31,7 +31,7 @@ mod weather;
 pub use error::LidarError;
 pub(in crate::sensors) use mesh::{GroundGrid, flat_ground_m};
 pub use nearest::nearest_objects;
-pub(in crate::sensors) use random::exp_minus;
+pub(in crate::sensors) use random::{ScanKey, draw, exp_minus};
 pub use scan::ScanScratch;
 pub use targets::Targets;
 

@@ -8,21 +8,24 @@ use ipc_schema::sensor::NoiseStream;
 use super::simd::{Floats, Simd};
 use crate::noise::philox4x32;
 
-/// Number of the LIDAR's random stream.
-const LIDAR: u32 = NoiseStream::Lidar as u32;
-
 /// Random numbers of one scan.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct ScanKey {
+pub(in crate::sensors) struct ScanKey {
     key: [u32; 2],
     rest: [u32; 3],
 }
 
 impl ScanKey {
     pub(super) fn new(episode_seed: u64, id_hash: u64, tick: u64) -> Self {
+        Self::of(NoiseStream::Lidar, episode_seed, id_hash, tick)
+    }
+
+    /// The key of a sample of another sensor.
+    pub(in crate::sensors) fn of(stream: NoiseStream, episode_seed: u64, id_hash: u64, tick: u64) -> Self {
+        let stream = stream as u32;
         let counter = [
             tick as u32,
-            LIDAR | ((tick >> 32) as u32) << 8,
+            stream | ((tick >> 32) as u32) << 8,
             id_hash as u32,
             (id_hash >> 32) as u32,
         ];
@@ -30,15 +33,15 @@ impl ScanKey {
         let [a, b, c, d] = philox4x32(counter, seed);
         Self {
             key: [a, b],
-            rest: [LIDAR, c, d],
+            rest: [stream, c, d],
         }
     }
 }
 
 /// Random numbers of two groups of rays.
-pub(super) struct RayRandoms<S: Simd> {
+pub(in crate::sensors) struct RayRandoms<S: Simd> {
     /// Standard normal.
-    pub(super) normal: [S::F; 2],
+    pub(in crate::sensors) normal: [S::F; 2],
     /// In (0, 1).
     pub(super) uniform: [S::F; 2],
 }
@@ -68,7 +71,7 @@ pub(super) fn fill<S: Simd>(key: &ScanKey, first: u32, groups: usize, normal: &m
 
 /// Random numbers of two groups of a scan.
 #[inline(always)]
-pub(super) fn draw<S: Simd>(key: &ScanKey, number: u32) -> RayRandoms<S> {
+pub(in crate::sensors) fn draw<S: Simd>(key: &ScanKey, number: u32) -> RayRandoms<S> {
     let [a, b, c, d] = S::philox(number.wrapping_mul(16), key.rest, key.key);
     // Box and Muller.
     let radius = S::sqrt(S::splat(-2.0) * ln::<S>(uniform::<S>(a)));

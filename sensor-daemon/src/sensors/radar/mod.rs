@@ -229,6 +229,7 @@ impl RadarModel {
         };
         let (camera, objects) = (&mut scratch.camera, &mut scratch.objects);
         let shot = CameraShot {
+            noise: None,
             targets: seen,
             carrier: Some(row),
             pose: *pose,
