@@ -255,10 +255,6 @@ impl SpanScan<'_> {
         for group in 0..canvas.groups {
             let place = column * canvas.groups + group;
             let z = S::load(&canvas.direction[2][place]);
-            if self.order.lidar.ground_m.is_none() {
-                self.lay::<S>(canvas, place, 0.0, (limit, limit), z);
-                continue;
-            }
             self.lay::<S>(canvas, place, height, (S::splat(-height) / z, limit), z);
         }
     }

@@ -99,10 +99,13 @@ impl ScanOrder<'_> {
             .candidates
             .sort(&scratch.spans, (begin % rotation, count), rotation);
         let is_upright = lidar.is_flat_fan && self.targets.is_upright(self.row);
+        // Code for hills of its own: as a part of the other, it would cost flat ground a twentieth.
         if is_upright {
-            self.spans::<S, true>(begin, scratch, points)
+            self.spans::<S, true, false>(begin, scratch, points)
+        } else if lidar.terrain.is_some() {
+            self.spans::<S, false, true>(begin, scratch, points)
         } else {
-            self.spans::<S, false>(begin, scratch, points)
+            self.spans::<S, false, false>(begin, scratch, points)
         }
     }
 
@@ -146,7 +149,7 @@ impl ScanOrder<'_> {
     }
 
     #[inline(always)]
-    fn spans<S: Simd, const UPRIGHT: bool>(
+    fn spans<S: Simd, const UPRIGHT: bool, const HILLS: bool>(
         &self,
         begin: usize,
         scratch: &mut ScanScratch,
@@ -179,14 +182,14 @@ impl ScanOrder<'_> {
                 begin,
                 dt_s: self.dt_s(),
             };
-            let terrain = lidar.terrain.as_ref();
+            let terrain = if HILLS { lidar.terrain.as_ref() } else { None };
             let terrain = terrain.and_then(|terrain| Some((terrain, terrain.view(&work.sensors)?)));
             work.start::<S, UPRIGHT>(canvas);
-            if !UPRIGHT && let Some((terrain, view)) = &terrain {
+            if HILLS && let Some((terrain, view)) = &terrain {
                 work.near_relief::<S>(canvas, (terrain, view), profile);
             }
             work.surfaces::<S, UPRIGHT>(canvas, candidates, candidates.of_span(number), walls);
-            if !UPRIGHT && let Some((terrain, view)) = &terrain {
+            if HILLS && let Some((terrain, view)) = &terrain {
                 work.far_relief::<S>(canvas, (terrain, view), profile);
             }
             if !UPRIGHT && !lidar.meshes.is_empty(terrain.is_none()) {
