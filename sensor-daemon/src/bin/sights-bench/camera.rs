@@ -32,11 +32,11 @@ const SIZES: [[usize; 2]; 2] = [[84, 84], [320, 160]];
 enum Shows {
     /// Depth, instance, semantic.
     Labels,
-    /// These and colours.
+    /// The labels and colours.
     Rgb,
     /// The apparent temperature alone.
     Infrared,
-    /// These and the optical flow.
+    /// The labels and the optical flow.
     Flow,
     /// The events of a tick of ten sub-steps alone.
     Events,
