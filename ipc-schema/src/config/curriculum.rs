@@ -242,6 +242,32 @@ mod tests {
         }
     }
 
+    /// The noise of a pixel as a share of full brightness, at a share of it.
+    fn pixel_noise(config: &Config, share: f64) -> f64 {
+        let camera = &config.camera;
+        (share * camera.full_well_e + camera.read_noise_e.powi(2)).sqrt() / camera.full_well_e
+    }
+
+    #[test]
+    fn a_stage_scales_the_noise_of_a_pixel_at_any_brightness() {
+        let mut config = Config::from_json(include_str!("../../tests/town.json")).unwrap();
+        let camera = &mut config.camera;
+        (camera.full_well_e, camera.read_noise_e, camera.infrared_noise_k) = (9000.0, 12.0, 0.05);
+        config.curriculum.stages = [0.5, 3.0, 0.0]
+            .map(|noise| serde_json::from_value(serde_json::json!({ "cavs": 1, "noise": noise })).unwrap())
+            .to_vec();
+        for (stage, factor) in [(1, 0.5), (2, 3.0)] {
+            let scaled = config.in_stage(stage);
+            for share in [0.0, 0.01, 0.4, 1.0] {
+                let ratio = pixel_noise(&scaled, share) / pixel_noise(&config, share);
+                assert!((ratio / factor - 1.0).abs() < 1e-12, "{factor} at {share}: {ratio}");
+            }
+            assert!((scaled.camera.infrared_noise_k - 0.05 * factor).abs() < 1e-12);
+        }
+        let silent = config.in_stage(3).camera;
+        assert_eq!((silent.full_well_e, silent.infrared_noise_k), (0.0, 0.0));
+    }
+
     #[test]
     fn a_stage_on_a_map_that_the_run_does_not_have_is_found() {
         let stage = |maps: &[&str]| serde_json::from_value(serde_json::json!({ "cavs": 1, "maps": maps })).unwrap();
