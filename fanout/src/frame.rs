@@ -269,17 +269,13 @@ fn encode_collisions(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFr
 
 /// Encodes the states of road users, without sub-steps.
 fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let layout = WorldLayout::new(header.rows(), 0);
+    let layout = WorldLayout::of(header);
     let states: &[VehicleState] = view(payload, layout.states)?;
-    let header = MessageHeader {
-        shape: layout.shape,
-        ..*header
-    };
     let max_rows = (MAX_FRAME_BYTES - HEADER_BYTES) / size_of::<VehicleState>();
     if states.len() <= max_rows {
-        return Ok(thinned(&header, &[], states, MAX_FRAME_BYTES));
+        return Ok(world_frame(header, states));
     }
-    // Heroes are few, and a viewer follows them.
+    // Heroes are few, and a viewer follows them. The bodies of a vehicle have its hash: they are kept or left out together but for one.
     let order = states.iter().map(|state| match state.kind == Kind::Hero as u32 {
         true => 0,
         false => sampling_order(state.id_hash),
@@ -287,8 +283,21 @@ fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, 
     let kept: Vec<VehicleState> = first_by_order(order, max_rows).iter().map(|row| states[*row]).collect();
     Ok(EncodedFrame {
         left_out: states.len() - kept.len(),
-        ..thinned(&header, &[], &kept, MAX_FRAME_BYTES)
+        ..world_frame(header, &kept)
     })
+}
+
+/// Header and states: road users and, behind them, trailing bodies.
+fn world_frame(header: &MessageHeader, states: &[VehicleState]) -> EncodedFrame {
+    let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+    let header = MessageHeader {
+        shape: WorldLayout::with_heroes(road_users, 0, 0, states.len() - road_users).shape,
+        ..*header
+    };
+    EncodedFrame {
+        bytes: [bytes_of(&header), bytemuck::cast_slice(states)].concat(),
+        left_out: 0,
+    }
 }
 
 /// Encodes a scan: where the sensor was (`S`), and the returns (`R`) that fit.

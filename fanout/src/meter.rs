@@ -59,7 +59,7 @@ impl RoadUserCounts {
     /// Counts the road users of a `world` message; `None` if its payload is shorter than its header promises.
     #[must_use]
     pub fn of(header: &MessageHeader, payload: &[u8]) -> Option<Self> {
-        let states: &[VehicleState] = view(payload, WorldLayout::new(header.rows(), 0).states).ok()?;
+        let states: &[VehicleState] = view(payload, WorldLayout::of(header).road_users()).ok()?;
         let mut count = Self::default();
         for state in states {
             match state.kind {

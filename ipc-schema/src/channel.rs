@@ -21,7 +21,7 @@ use crate::{
         EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, SIGNALS_PER_MESSAGE, TrafficLayout,
         TrafficMetaLayout,
     },
-    world::WorldLayout,
+    world::{WorldLayout, most_trailing},
 };
 
 /// Messages a process may hold besides those in its queue.
@@ -245,7 +245,8 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         when_full: FullQueue::DropNewest,
         max_payload: |run| {
             let sub_steps = run.config.run.sub_steps as usize;
-            WorldLayout::with_heroes(road_users(run), sub_steps, run.config.heroes()).len
+            let road_users = road_users(run);
+            WorldLayout::with_heroes(road_users, sub_steps, run.config.heroes(), most_trailing(road_users)).len
         },
         // A trainer that watches is behind sensor-daemon by another window.
         queue_length: |run| match run.config.trainer.road_users {

@@ -141,6 +141,8 @@ pub fn table() -> Vec<TypeLayout> {
             height_m,
             wheelbase_m,
             rear_overhang_m,
+            whole_length_m,
+            trailing,
             vehicle,
             kind,
             signals,
@@ -513,6 +515,23 @@ pub fn json() -> Result<String, serde_json::Error> {
 mod tests {
     /// `CARAWARE_BLESS=1 cargo test -p ipc-schema layout` rewrites the table after a deliberate change
     /// (raise `SCHEMA_VERSION` with it).
+    /// A field that is not listed would leave a gap, and readers in other languages without it.
+    #[test]
+    fn the_fields_of_a_type_are_all_of_its_bytes() {
+        let types: serde_json::Value = serde_json::from_str(&super::json().unwrap()).unwrap();
+        for of in types["types"].as_array().unwrap() {
+            let mut end = 0;
+            for field in of["fields"].as_array().unwrap() {
+                let scalar = field[2].as_str().unwrap();
+                let digits = scalar.trim_start_matches(|c: char| !c.is_ascii_digit());
+                let shape = field[3].as_array().unwrap().iter().map(|size| size.as_u64().unwrap());
+                assert_eq!(field[1].as_u64(), Some(end), "{} before {}", of["name"], field[0]);
+                end += digits.parse::<u64>().unwrap() * shape.product::<u64>();
+            }
+            assert_eq!(of["size"].as_u64(), Some(end), "{}", of["name"]);
+        }
+    }
+
     #[test]
     fn the_committed_layout_table_is_current() {
         let json = super::json().unwrap();

@@ -193,6 +193,6 @@ mod tests {
         assert_eq!(numpy_type::<[[f32; 2]; 4]>(), ("<f4".to_owned(), vec![4, 2]));
         let states = WorldLayout::SECTIONS[0];
         assert_eq!((states.element)(), ("VehicleState".to_owned(), vec![]));
-        assert_eq!(states.dimensions, ["road_users"]);
+        assert_eq!(states.dimensions, ["bodies"]);
     }
 }

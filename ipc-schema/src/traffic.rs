@@ -16,6 +16,9 @@ pub enum Kind {
     Person = 2,
     /// Vehicle that actions drive (driving task); it carries sensors like a [`Kind::Cav`].
     Hero = 3,
+    /// Trailing body of an articulated vehicle, in `world` alone: a trailer or a carriage, which has no sensors and no row of its own in
+    /// any other message.
+    Trailing = 4,
 }
 
 /// SUMO set this road user's position (teleport, insertion, `moveToXY`): do not interpolate across this step.

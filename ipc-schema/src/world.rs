@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::section::payload_layout;
+use crate::{block::Section, section::payload_layout};
 
 /// The pose was set instead of reached by motion: insertion, teleport or resynchronisation.
 pub const RESYNCHRONISED: u32 = 1;
@@ -32,10 +32,40 @@ pub const BLOCKED: u32 = 1 << 10;
 /// let the vehicle carry it. Bits of flags are below.
 pub const SUITES_SHIFT: u32 = 16;
 
-/// One road user at the end of a tick.
+/// First bit of [`VehicleState::vehicle`] that numbers the bodies of an articulated vehicle. The bits below are the dense index of the
+/// vehicle, those from here on the place of a trailing body behind its leading one, from 1 on.
+pub const BODY_SHIFT: u32 = 25;
+/// Most trailing bodies of a vehicle: the two highest bits of an index name static objects and carriers beside the road.
+pub const MOST_TRAILING: u32 = 31;
+
+/// Index of the trailing body `place` (from 1 on) of a vehicle.
+#[must_use]
+pub const fn trailing_index(vehicle: u32, place: u32) -> u32 {
+    vehicle | place << BODY_SHIFT
+}
+
+/// Dense index of the vehicle that a body belongs to.
+#[must_use]
+pub const fn vehicle_of(body: u32) -> u32 {
+    body & ((1 << BODY_SHIFT) - 1)
+}
+
+/// Trailing bodies that a `world` message of `road_users` has room for. The bodies of the last vehicles are left out beyond that.
+#[must_use]
+pub const fn most_trailing(road_users: usize) -> usize {
+    road_users / 2 + 32
+}
+
+/// One road user at the end of a tick, or a trailing body of one.
 ///
 /// World frame: metres in the net's projected coordinates, x east, y north, z up. Body frame: x forward, y left, z up,
-/// origin at the centre of the rear axle on the ground (persons: their centre on the ground).
+/// origin at the centre of the rear axle on the ground (persons: their centre on the ground; carriages and vehicles on rails: midway
+/// between the bogies).
+///
+/// An articulated vehicle is its leading body, and the size is that body's. Each trailing body is a state of its own with the kind
+/// [`crate::traffic::Kind::Trailing`], the hash of its vehicle and an index by [`trailing_index`]. Its origin is its axle, or midway
+/// between its bogies. It moved evenly through the tick, so its velocities are means over the tick. It has no acceleration, wheel angle,
+/// tracking error or sensors; signals and the flags [`RESYNCHRONISED`] and [`APPEARED`] are those of its vehicle.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct VehicleState {
@@ -71,11 +101,15 @@ pub struct VehicleState {
     pub width_m: f32,
     /// Metres.
     pub height_m: f32,
-    /// Rear axle to front axle, metres.
+    /// Rear axle to front axle, metres. Of a trailing body: axle to hitch, or half the distance of the bogies.
     pub wheelbase_m: f32,
-    /// Rear axle to rear bumper, metres.
+    /// Rear axle to the rear end of the body, metres; negative if the body ends before the axle, as a tractor's cab does.
     pub rear_overhang_m: f32,
-    /// Dense index within the episode.
+    /// From the front to the end of the last body in a straight line, metres: SUMO's length.
+    pub whole_length_m: f32,
+    /// Trailing bodies behind this one that belong to the same vehicle and are in the message.
+    pub trailing: u32,
+    /// Dense index within the episode; of a trailing body [`trailing_index`].
     pub vehicle: u32,
     /// A [`crate::traffic::Kind`].
     pub kind: u32,
@@ -210,11 +244,12 @@ impl Default for HeroView {
 }
 
 payload_layout! {
-    /// Layout of a `world` message: road users, their sub-steps vehicle by vehicle, and the views of the heroes by ascending index.
-    WorldLayout(road_users, sub_steps_each, hero_count) {
-        /// `VehicleState [count]`.
-        states: VehicleState, [road_users];
-        /// `SubStep [count, sub_steps]`.
+    /// Layout of a `world` message: road users by ascending index and behind them trailing bodies by vehicle and place, the sub-steps of
+    /// the road users one after the other, and the views of the heroes by ascending index.
+    WorldLayout(road_users, sub_steps_each, hero_count, bodies) {
+        /// `VehicleState [bodies]`.
+        states: VehicleState, [bodies];
+        /// `SubStep [road_users, sub_steps]`.
         sub_steps: SubStep, [road_users, sub_steps_each];
         /// `HeroView [heroes]`.
         heroes: HeroView, [hero_count];
@@ -222,15 +257,25 @@ payload_layout! {
 }
 
 impl WorldLayout {
-    /// Layout for `count` road users with `sub_steps` samples each, none of them a hero.
+    /// Layout for `count` road users with `sub_steps` samples each, none of them a hero or articulated.
     #[must_use]
     pub fn new(count: usize, sub_steps: usize) -> Self {
-        Self::sized(count, sub_steps, 0)
+        Self::sized(count, sub_steps, 0, count)
     }
 
-    /// Layout for `count` road users with `sub_steps` samples each, `heroes` of them heroes.
+    /// Layout for `count` road users with `sub_steps` samples each, `heroes` of them heroes, and `trailing` bodies behind them.
     #[must_use]
-    pub fn with_heroes(count: usize, sub_steps: usize, heroes: usize) -> Self {
-        Self::sized(count, sub_steps, heroes)
+    pub fn with_heroes(count: usize, sub_steps: usize, heroes: usize, trailing: usize) -> Self {
+        Self::sized(count, sub_steps, heroes, count.saturating_add(trailing))
+    }
+
+    /// The first of `states`: road users without trailing bodies.
+    #[must_use]
+    pub fn road_users(&self) -> Section {
+        let len = (self.shape[0] as usize).saturating_mul(size_of::<VehicleState>());
+        Section {
+            len: len.min(self.states.len),
+            ..self.states
+        }
     }
 }

@@ -123,6 +123,7 @@ fn round(config: &Config) -> f64 {
     let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
     let world = WorldTick {
         states: &states,
+        bodies: &states,
         sub_steps: &sub_steps,
         views: &[],
     };

@@ -318,7 +318,8 @@ impl Daemon {
 fn world_tick<'a>(message: &'a Message, header: &MessageHeader) -> Result<WorldTick<'a>, Failure> {
     let (payload, layout) = (message.payload(), WorldLayout::of(header));
     Ok(WorldTick {
-        states: block::view(payload, layout.states).map_err(unreadable)?,
+        states: block::view(payload, layout.road_users()).map_err(unreadable)?,
+        bodies: block::view(payload, layout.states).map_err(unreadable)?,
         sub_steps: block::view(payload, layout.sub_steps).map_err(unreadable)?,
         views: block::view(payload, layout.heroes).map_err(unreadable)?,
     })

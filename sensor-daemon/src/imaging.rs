@@ -310,7 +310,7 @@ impl CameraImaging {
         };
         Self {
             cameras,
-            targets: Targets::default(),
+            targets: Targets::in_ticks_of(config.run.tick_s),
             seen: CameraTargets::default(),
             scratch: CameraScratch::default(),
             objects: Vec::new(),

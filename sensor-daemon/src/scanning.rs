@@ -72,7 +72,7 @@ impl LidarScanning {
         }
         Ok(Self {
             lidars,
-            targets: Targets::default(),
+            targets: Targets::in_ticks_of(config.run.tick_s),
             scratch: ScanScratch::default(),
             due: Vec::new(),
             publisher,

@@ -59,6 +59,8 @@ impl SensingState {
 pub struct WorldTick<'a> {
     /// All road users at the end of the tick.
     pub states: &'a [VehicleState],
+    /// The same, and the trailing bodies of articulated vehicles behind them: what sensors meet.
+    pub bodies: &'a [VehicleState],
     /// The sub-steps of each road user, one after the other; empty = each state stands for one sub-step.
     pub sub_steps: &'a [SubStep],
     /// Route and traffic ahead of each hero.

@@ -106,16 +106,16 @@ impl Surroundings {
         sensing: &mut Sensing,
     ) -> Result<(), Failure> {
         if let Some(lidars) = &mut self.lidars {
-            lidars.scan(header, road_users.states, road_users.sub_steps, &self.beside, sensing)?;
+            lidars.scan(header, road_users.bodies, road_users.sub_steps, &self.beside, sensing)?;
         }
         if let Some(ultrasonic) = &mut self.ultrasonic {
-            ultrasonic.sample(header, road_users.states, sensing);
+            ultrasonic.sample(header, road_users.bodies, sensing);
         }
         if let Some(cameras) = &mut self.cameras {
-            cameras.take(header, road_users.states, road_users.sub_steps, &self.beside, sensing)?;
+            cameras.take(header, road_users.bodies, road_users.sub_steps, &self.beside, sensing)?;
         }
         if let Some(radars) = &mut self.radars {
-            radars.scan(header, road_users.states, &self.beside, sensing)?;
+            radars.scan(header, road_users.bodies, &self.beside, sensing)?;
         }
         Ok(())
     }

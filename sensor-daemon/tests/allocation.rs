@@ -67,6 +67,7 @@ fn a_tick_allocates_nothing() {
     let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
     let world = WorldTick {
         states: &states,
+        bodies: &states,
         sub_steps: &sub_steps,
         views: &[],
     };

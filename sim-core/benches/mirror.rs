@@ -66,6 +66,7 @@ fn settings(preview_s: f64) -> MirrorSettings {
         hero_driver: config::HeroDriver::Actions,
         suites: None,
         wheel_slip: false,
+        most_trailing: 100,
     }
 }
 

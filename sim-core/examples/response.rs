@@ -118,7 +118,7 @@ fn print(case: &Case<'_>, time_s: f64, vehicle: &Vehicle, motion: &SubStepMotion
 fn main() {
     let catalogue = ParameterCatalogue::new().unwrap();
     let set = catalogue.sets().iter().find(|set| set.name == "sedan").unwrap();
-    let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+    let body = set.dimensions(set.whole_length_m(), set.width_m, set.height_m);
     let cg = set.front_load_share * body.wheelbase_m;
     println!(
         "figure,model,surface,t_s,road_wheel_angle_rad,speed_mps,x_m,lateral_mps2,yaw_rate_radps,slip_rad,roll_rad,pitch_rad"

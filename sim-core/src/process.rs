@@ -259,7 +259,8 @@ impl CoreProcess {
             None => 0,
         };
         let (ours, settings) = (self.membership.header(), self.mirror.settings());
-        let layout = WorldLayout::with_heroes(count, settings.sub_steps as usize, heroes);
+        let trailing = self.mirror.trailing_count(tick);
+        let layout = WorldLayout::with_heroes(count, settings.sub_steps as usize, heroes, trailing);
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,

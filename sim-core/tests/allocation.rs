@@ -80,6 +80,7 @@ fn a_tick_allocates_nothing() {
         hero_driver: config::HeroDriver::Actions,
         suites: None,
         wheel_slip: false,
+        most_trailing: 100,
     };
     let mut mirror = Mirror::new(settings).unwrap();
     let metas: Vec<VehicleMeta> = (0..VEHICLES).map(meta).collect();

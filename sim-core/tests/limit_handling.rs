@@ -94,7 +94,7 @@ impl Reference {
     fn params(&self, surface: Surface) -> DynamicParams {
         let catalogue = ParameterCatalogue::new().unwrap();
         let set = catalogue.default_set();
-        let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+        let body = set.dimensions(set.whole_length_m(), set.width_m, set.height_m);
         DynamicParams {
             wheelbase_m: self.wheelbase_m(),
             cg_to_rear_m: self.cg_to_rear_m,

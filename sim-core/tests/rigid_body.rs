@@ -28,7 +28,7 @@ fn limits() -> config::VehicleConfig {
 fn set(class: &str, length_m: f64) -> (ParameterSet, VehicleDimensions) {
     let catalogue = ParameterCatalogue::new().unwrap();
     let set = catalogue.sets()[catalogue.choose(class.as_bytes(), length_m).set].clone();
-    let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+    let body = set.dimensions(set.whole_length_m(), set.width_m, set.height_m);
     (set, body)
 }
 
@@ -239,7 +239,7 @@ fn two_wheelers_are_refused() {
 fn any_input_leaves_the_state_finite_and_steering_gains_no_speed() {
     let four_wheels = ParameterCatalogue::new().unwrap();
     for set in four_wheels.sets().iter().filter(|set| set.roll_per_mps2_rad > 0.0) {
-        let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+        let body = set.dimensions(set.whole_length_m(), set.width_m, set.height_m);
         for (surface, speed) in [(1.0, 25.0), (0.3, 25.0), (1.0, 8.0)] {
             let mut vehicle = vehicle(&(set.clone(), body), surface);
             let states = run(&mut vehicle, rolling(speed), 0.0, 30.0, |t| {

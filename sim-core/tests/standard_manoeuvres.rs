@@ -43,7 +43,7 @@ fn wide() -> config::VehicleConfig {
 }
 
 fn dynamic(set: &ParameterSet) -> DynamicParams {
-    let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+    let body = set.dimensions(set.whole_length_m(), set.width_m, set.height_m);
     DynamicParams::new(set, &body, &wide(), 1.0, DT_S)
 }
 
@@ -65,7 +65,7 @@ fn on_tyres() -> Vec<ParameterSet> {
 fn test_speed_mps(set: &ParameterSet) -> f64 {
     match set.name.as_str() {
         "bicycle" => 20.0 * KMH,
-        "bus" | "truck" | "trailer_truck" => 60.0 * KMH,
+        "bus" | "articulated_bus" | "truck" | "trailer_truck" => 60.0 * KMH,
         _ => 80.0 * KMH,
     }
 }
@@ -73,7 +73,7 @@ fn test_speed_mps(set: &ParameterSet) -> f64 {
 /// Steady lateral acceleration of the step, m/s²: 4 as ISO 7401 has it, less for what is tall.
 fn test_lateral_mps2(set: &ParameterSet) -> f64 {
     match set.name.as_str() {
-        "bus" | "truck" | "trailer_truck" | "bicycle" => 2.0,
+        "bus" | "articulated_bus" | "truck" | "trailer_truck" | "bicycle" => 2.0,
         _ => 4.0,
     }
 }
@@ -297,7 +297,7 @@ fn braking_rule(set: &ParameterSet) -> Option<(f64, f64, &'static str)> {
     match set.name.as_str() {
         "small_car" | "sedan" => row(100.0, 0.1, 0.0060, "UN R13-H"),
         "van" => row(80.0, 0.15, 1.0 / 130.0, "UN R13"),
-        "bus" | "truck" | "trailer_truck" => row(60.0, 0.15, 1.0 / 130.0, "UN R13"),
+        "bus" | "articulated_bus" | "truck" | "trailer_truck" => row(60.0, 0.15, 1.0 / 130.0, "UN R13"),
         "motorcycle" => row(60.0, 0.1, 0.0087, "UN R78"),
         "bicycle" => Some((25.0, 7.0, "ISO 4210-2")),
         _ => None,

@@ -72,12 +72,14 @@ pub struct OwnMeasurement {
 /// Size of a vehicle, as its station knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct VehicleSize {
-    /// Bumper to bumper, metres.
+    /// Front to rear, trailing bodies in a straight line included, metres.
     pub length_m: f64,
     /// Metres.
     pub width_m: f64,
-    /// Rear axle to rear bumper, metres.
+    /// Rear axle of the leading body to the rear, metres.
     pub rear_overhang_m: f64,
+    /// It has trailing bodies.
+    pub has_trailer: bool,
 }
 
 impl OwnMeasurement {
@@ -430,6 +432,7 @@ impl MessageComposer<'_> {
             speed_cmps: Some(self.speed_cmps()),
             speed_confidence: Some(confidence(self.deviations.speed_mps, 0.01)),
             length_10cm: tenths(size.length_m).clamp(1.0, 1022.0) as u16,
+            has_trailer: size.has_trailer,
             width_10cm: tenths(size.width_m).clamp(1.0, 61.0) as u8,
             acceleration: Some((own.accel_mps2 * 10.0).round().clamp(-160.0, 160.0) as i16),
             yaw_rate: Some(

@@ -60,6 +60,7 @@ fn cam(of: &Value) -> Cam {
         speed_cmps: optional(&of["speed_cmps"]),
         speed_confidence: optional(&of["speed_confidence"]),
         length_10cm: number(&of["length_10cm"]),
+        has_trailer: of["has_trailer"].as_bool().unwrap_or(false),
         width_10cm: number(&of["width_10cm"]),
         acceleration: optional(&of["acceleration"]),
         yaw_rate: optional(&of["yaw_rate"]),

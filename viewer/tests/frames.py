@@ -41,7 +41,7 @@ def states(count: int = 3, tick: int = 0, **fields: Any) -> np.ndarray:
 
 
 def world(tick: int, count: int = 3, **fields: Any) -> bytes:
-    return header(tick, count) + states(count, tick, **fields).tobytes()
+    return header(tick, count, 0, 0, count) + states(count, tick, **fields).tobytes()
 
 
 def observation(

@@ -41,7 +41,7 @@ from caraware_viewer.link import RunKey
 ROOT = Path(__file__).parents[2]
 CARAWARE = ROOT / "target" / "release" / "caraware"
 RUN = RunKey("crowd", 0)
-MAX_ROWS, MAX_SLOTS = 6249, 2300
+MAX_ROWS, MAX_SLOTS = 5920, 2300
 """Rows of `world` and slots of `observation` (9 fields, 10 samples of the IMU) that fit into a frame."""
 SIDE_M, SPACING_M = 5000.0, 250.0
 RATE_HZ, STATUS_TICKS = 10.0, 5

@@ -65,6 +65,22 @@ def test_brake_lights_are_at_the_rear() -> None:
     assert geometry.brake_lights_m(states(signals=geometry.BRAKE, kind=wire.PERSON)).shape == (0, 2)
 
 
+def test_a_trailing_body_has_its_vehicles_colour_and_the_last_one_the_brake_lights() -> None:
+    hero = states(kind=wire.HERO, vehicle=5, trailing=2, signals=geometry.BRAKE)
+    behind = [
+        states(kind=wire.TRAILING, vehicle=5 | place << wire.BODY_SHIFT, trailing=2 - place, x_m=-10.0 * place)
+        for place in (1, 2)
+    ]
+    for body in behind:
+        body["signals"] = geometry.BRAKE
+    train = np.concatenate([hero, *behind])
+    assert geometry.kinds(train).tolist() == [wire.HERO] * 3
+    # A sample may have left out the vehicle.
+    assert geometry.kinds(train[1:]).tolist() == [wire.OTHER] * 2
+    lights = geometry.brake_lights_m(train)
+    assert len(lights) == 2 and (lights[:, 0] < -20).all()
+
+
 def test_hatching_fills_a_polygon_with_a_notch() -> None:
     outline = np.array([[0, 0], [10, 0], [10, 10], [6, 10], [6, 4], [4, 4], [4, 10], [0, 10]])
     segments = geometry.hatching_m(outline, 0.1)

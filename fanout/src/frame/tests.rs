@@ -44,7 +44,7 @@ fn world_keeps_every_state_and_no_sub_step() {
     bytes[..layout.states.len].copy_from_slice(cast_slice(&states(3)));
     let frame = encode(Channel::World, &header(layout.shape), bytes).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
-    assert_eq!(head, header([3, 0, 0, 0]));
+    assert_eq!(head, header([3, 0, 0, 3]));
     assert_eq!(body, cast_slice::<_, u8>(&states(3)));
     assert_eq!(frame.left_out, 0);
 }
@@ -52,11 +52,12 @@ fn world_keeps_every_state_and_no_sub_step() {
 #[test]
 fn a_crowd_is_sampled_by_id_and_counted() {
     let shown = |crowd: &[VehicleState]| -> BTreeSet<u64> {
-        let shape = [u32::try_from(crowd.len()).unwrap(), 0, 0, 0];
+        let count = u32::try_from(crowd.len()).unwrap();
+        let shape = [count, 0, 0, count];
         let frame = encode(Channel::World, &header(shape), cast_slice(crowd)).unwrap();
         let (head, body) = decode(&frame.bytes).unwrap();
         assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
-        assert_eq!((head.rows() + frame.left_out, head.rows()), (crowd.len(), 6_249));
+        assert_eq!((head.rows() + frame.left_out, head.rows()), (crowd.len(), 5_920));
         let rows = body
             .chunks_exact(size_of::<VehicleState>())
             .map(pod_read_unaligned::<VehicleState>);

@@ -150,6 +150,7 @@ impl Run {
         let mut payload = vec![0_u64; layout.len / 8];
         let world = WorldTick {
             states,
+            bodies: states,
             sub_steps,
             views: &[],
         };

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use ipc_schema::{
     event::{Collision, Struck},
     traffic::{Kind, id_hash},
-    world::{COLLIDED, VehicleState},
+    world::{COLLIDED, VehicleState, vehicle_of},
 };
 
 use crate::scene::{
@@ -39,7 +39,7 @@ struct Contact {
     class: u32,
     /// Dense index of the other road user, or number in the scene.
     other: u32,
-    /// Rows in the world; of a solid its number in the scene.
+    /// Rows of the bodies in the world; of a solid its number in the scene.
     rows: (u32, u32),
 }
 
@@ -59,7 +59,10 @@ pub struct CollisionDetector {
     /// Over solids grown by [`REACHES_M`].
     indices: [Grid; 2],
     bodies: Vec<CollisionBody>,
+    /// By body: whether its contacts matter by themselves.
     watched: Vec<bool>,
+    /// By body: row of the road user that it belongs to.
+    owners: Vec<u32>,
     broad: BroadPhase,
     near: Vec<u32>,
     episode: Option<u64>,
@@ -88,6 +91,7 @@ impl CollisionDetector {
             scene,
             bodies: Vec::new(),
             watched: Vec::new(),
+            owners: Vec::new(),
             broad: BroadPhase::default(),
             near: Vec::new(),
             episode: None,
@@ -109,7 +113,9 @@ impl CollisionDetector {
         &self.begun
     }
 
-    /// Looks for contacts at the end of a tick and sets [`COLLIDED`] where one begins; [`CollisionDetector::begun`] lists them.
+    /// Looks for contacts at the end of a tick and sets [`COLLIDED`] where one begins; [`CollisionDetector::begun`] lists them. `states`
+    /// are those of a `world` message: what a trailing body touches, its vehicle touches, and the bodies of one vehicle do not touch
+    /// each other.
     pub fn detect(&mut self, episode: u64, states: &mut [VehicleState]) {
         if self.episode != Some(episode) {
             self.episode = Some(episode);
@@ -130,16 +136,24 @@ impl CollisionDetector {
     fn collect_bodies(&mut self, states: &[VehicleState]) -> f64 {
         self.bodies.clear();
         self.watched.clear();
+        self.owners.clear();
         let mut most_m = 0.0;
-        for state in states {
+        for (row, state) in (0_u32..).zip(states) {
             let body = CollisionBody::of(state);
             let reach_m = body.reach_m();
             if reach_m <= LARGE_M && reach_m > most_m {
                 most_m = reach_m;
             }
             self.bodies.push(body);
-            self.watched
-                .push(state.kind == Kind::Cav as u32 || state.kind == Kind::Hero as u32);
+            // The bodies of a vehicle follow all road users, whose indices ascend.
+            let is_trailing = state.kind == Kind::Trailing as u32;
+            let owner = match is_trailing {
+                true => owner_of(state, states).unwrap_or(row),
+                false => row,
+            };
+            let kind = states[owner as usize].kind;
+            self.owners.push(owner);
+            self.watched.push(kind == Kind::Cav as u32 || kind == Kind::Hero as u32);
         }
         most_m
     }
@@ -147,17 +161,22 @@ impl CollisionDetector {
     fn find_contacts_with_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
         for &(a, b) in self.broad.pairs(&self.bodies, &self.watched, reach_m) {
             let (one, two) = (a as usize, b as usize);
+            if self.owners[one] == self.owners[two] {
+                continue;
+            }
             let bodies = [&self.bodies[one], &self.bodies[two]];
             if !bodies[0].touches(bodies[1]) || self.scene.road().are_levels_apart(bodies.map(|body| &body.solid)) {
                 continue;
             }
-            // Rows are in ascending order of the index.
-            let (vehicle, other) = if self.watched[one] { (one, two) } else { (two, one) };
+            // Rows of road users are in ascending order of the index.
+            let is_first = self.owners[one] < self.owners[two];
+            let (low, high) = if is_first { (one, two) } else { (two, one) };
+            let (vehicle, other) = if self.watched[low] { (low, high) } else { (high, low) };
             let is_person = self.bodies[other].is_capsule;
             self.contacts.push(Contact {
-                vehicle: states[vehicle].vehicle,
+                vehicle: vehicle_of(states[vehicle].vehicle),
                 class: if is_person { Struck::Person } else { Struck::Vehicle } as u32,
-                other: states[other].vehicle,
+                other: vehicle_of(states[other].vehicle),
                 rows: (vehicle as u32, other as u32),
             });
         }
@@ -185,7 +204,7 @@ impl CollisionDetector {
                 }
                 if let Some(class) = struck(&self.scene, number, body) {
                     self.contacts.push(Contact {
-                        vehicle: states[row].vehicle,
+                        vehicle: vehicle_of(states[row].vehicle),
                         class: class as u32,
                         other: number,
                         rows: (row as u32, number),
@@ -198,7 +217,8 @@ impl CollisionDetector {
     /// Flags and describes contacts that did not exist in the tick before.
     fn flag_new_contacts(&mut self, states: &mut [VehicleState]) {
         self.contacts.sort_unstable();
-        self.contacts.dedup();
+        // Of two vehicles that touch with several bodies, the first pair of bodies describes the contact.
+        self.contacts.dedup_by_key(|contact| contact.key());
         for contact in &self.contacts {
             let known = self.before.binary_search_by_key(&contact.key(), Contact::key);
             if known.is_ok() {
@@ -206,9 +226,10 @@ impl CollisionDetector {
             }
             let collision = self.describe(contact, states);
             self.begun.push(collision);
-            states[contact.rows.0 as usize].flags |= COLLIDED;
+            let owner = |row: u32| self.owners[row as usize] as usize;
+            states[owner(contact.rows.0)].flags |= COLLIDED;
             if contact.class == Struck::Vehicle as u32 || contact.class == Struck::Person as u32 {
-                states[contact.rows.1 as usize].flags |= COLLIDED;
+                states[owner(contact.rows.1)].flags |= COLLIDED;
             }
         }
     }
@@ -248,6 +269,14 @@ impl CollisionDetector {
         };
         [flat[0], flat[1], common_height(body.solid.z_m, z_m)]
     }
+}
+
+/// Row of the vehicle that a trailing body belongs to.
+fn owner_of(body: &VehicleState, states: &[VehicleState]) -> Option<u32> {
+    let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+    let vehicle = vehicle_of(body.vehicle);
+    let row = states[..road_users].binary_search_by_key(&vehicle, |state| state.vehicle);
+    row.ok().map(|row| row as u32)
 }
 
 /// The class of the solid, if `body`, which touches the rectangle about it, also touches the solid.

@@ -10,7 +10,7 @@ use ipc_schema::{
     membership::RunMembership,
     ports::Publisher,
     services::Channel,
-    world::VehicleState,
+    world::{BODY_SHIFT, VehicleState, vehicle_of},
 };
 use serde::{Deserialize, Serialize};
 
@@ -133,6 +133,14 @@ struct ContactBody {
     speed_mps: f32,
     /// Side of its outline that is next to the point of contact.
     side: &'static str,
+    /// The trailing body that it was, from 1 on; 0 = the leading or only one.
+    #[serde(skip_serializing_if = "is_leading")]
+    trailing_body: u32,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_leading(place: &u32) -> bool {
+    *place == 0
 }
 
 impl ContactBody {
@@ -141,7 +149,20 @@ impl ContactBody {
         Self {
             speed_mps: libm::hypotf(forward_mps, left_mps),
             side: nearest_side(&CollisionBody::of(state).solid, [position_m[0], position_m[1]]),
+            trailing_body: state.vehicle >> BODY_SHIFT,
         }
+    }
+
+    /// The body of a vehicle that is nearest to the point of contact.
+    fn nearest(vehicle: u32, states: &[VehicleState], position_m: [f64; 3]) -> Option<Self> {
+        let away_m = |state: &VehicleState| {
+            let solid = CollisionBody::of(state).solid;
+            let local = solid.local_from_world([position_m[0], position_m[1]]);
+            (local[0].abs() - solid.half_m[0]).max(local[1].abs() - solid.half_m[1])
+        };
+        let bodies = states.iter().filter(|state| vehicle_of(state.vehicle) == vehicle);
+        let nearest = bodies.min_by(|a, b| away_m(a).total_cmp(&away_m(b)));
+        nearest.map(|state| Self::of(state, position_m))
     }
 }
 
@@ -252,7 +273,7 @@ impl ContactReporter {
             if let Some(cause) = cause {
                 self.counts.own.add(cause);
             }
-            let body = |vehicle: u32| state(vehicle).map(|state| ContactBody::of(state, collision.position_m));
+            let body = |vehicle: u32| ContactBody::nearest(vehicle, states, collision.position_m);
             let Some(own) = body(collision.vehicle) else { continue };
             let is_road_user = [Struck::Vehicle, Struck::Person]
                 .map(|class| class as u32)

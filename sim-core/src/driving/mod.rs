@@ -8,7 +8,7 @@ use ipc_schema::{
     traffic::{Kind, RoutePoint, SIGNAL_LINKS, SignalMeta},
     world::{
         ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, BLOCKED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD,
-        RED_LIGHT, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState,
+        RED_LIGHT, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState, vehicle_of,
     },
 };
 
@@ -365,14 +365,18 @@ impl HeroTrip {
     }
 }
 
-/// Gap to and speed of the next road user in the way of the hero in `row`: metres, m/s.
+/// Gap to and speed of the next body in the way of the hero in `row`: metres, m/s.
 fn leader(route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]) -> (f64, f64) {
     let hero = &states[row];
     let front_station_m = station_m + front_m(hero);
     let mut found = (SIGHT_M, 0.0);
     for (number, other) in states.iter().enumerate() {
         let reach_m = SIGHT_M + f64::from(hero.length_m + other.length_m);
-        if number == row || libm::hypot(other.x_m - hero.x_m, other.y_m - hero.y_m) > reach_m {
+        // Its own trailing bodies are behind it.
+        if number == row
+            || is_trailing_body_of(other, hero)
+            || libm::hypot(other.x_m - hero.x_m, other.y_m - hero.y_m) > reach_m
+        {
             continue;
         }
         let is_person = other.kind == Kind::Person as u32;
@@ -390,6 +394,11 @@ fn leader(route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]
         }
     }
     found
+}
+
+/// True if a state is that of a trailing body of a vehicle.
+fn is_trailing_body_of(body: &VehicleState, vehicle: &VehicleState) -> bool {
+    body.kind == Kind::Trailing as u32 && vehicle_of(body.vehicle) == vehicle.vehicle
 }
 
 /// Rear, middle and front of a road user on its centre line.

@@ -12,7 +12,7 @@ use ipc_schema::{
 };
 
 use super::{
-    ahead,
+    ahead, is_trailing_body_of,
     route::{Crossing, HeroRoute, StopLine},
 };
 
@@ -32,7 +32,7 @@ const SAME_LINE_M: f64 = 1.0;
 pub struct HeroSurroundings<'a> {
     /// Its route.
     pub route: &'a HeroRoute,
-    /// All road users.
+    /// All road users, and the trailing bodies behind them.
     pub states: &'a [VehicleState],
     /// Its row among them.
     pub row: usize,
@@ -77,7 +77,9 @@ impl HeroSurroundings<'_> {
     fn neighbours(&self) -> Vec<Neighbour<'_>> {
         let hero = self.hero();
         let here = middle(hero);
-        let others = self.states.iter().enumerate().filter(|(row, _)| *row != self.row);
+        let is_own = |state: &VehicleState| is_trailing_body_of(state, hero);
+        let others = self.states.iter().enumerate();
+        let others = others.filter(|(row, state)| *row != self.row && !is_own(state));
         let mut near: Vec<Neighbour<'_>> = others
             .filter(|(_, other)| {
                 let (dx, dy) = (other.x_m - hero.x_m, other.y_m - hero.y_m);

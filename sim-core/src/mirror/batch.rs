@@ -150,11 +150,14 @@ pub(super) fn path_limits(vehicle: &SizedModel) -> PathLimits {
         MotionModel::Kinematic(params) => (params.preview_limits(), params.max_curvature_per_m),
         MotionModel::Dynamic(params) => (params.preview_limits(), params.max_curvature_per_m),
     };
-    let (front_m, length_m) = (vehicle.dimensions.front_m(), vehicle.dimensions.length_m);
+    let (front_m, length_m) = (vehicle.dimensions.front_m(), vehicle.dimensions.whole_length_m);
+    let last_axle_m = vehicle.trailing.last_axle_m(front_m);
     let turn = rear_per_m * front_m;
     PathLimits {
         // In a circle of radius R whose front bumper is `swing / R` outside SUMO's, both bodies have their middle in one place.
-        swing_m2: SWING_SHARE * 0.5 * length_m * (front_m - 0.5 * length_m).max(0.0),
+        swing_m2: last_axle_m.map_or(0.0, |last_axle_m| {
+            SWING_SHARE * 0.5 * length_m * (last_axle_m - 0.5 * length_m).max(0.0)
+        }),
         driving,
         front_curvature_per_m: rear_per_m / (1.0 + turn * turn).sqrt(),
     }

@@ -119,7 +119,7 @@ pub struct GuidedPath {
 }
 
 /// Leads a vehicle along `curve` in sub-steps of `dt_s`, with SUMO's heading at the start and its rate, and moves it `sideways` as it
-/// stands. `turned` is by how much the vehicle's heading differs from SUMO's, and the rate. Returns, at the end, the height of the rear
+/// stands. The leading body of an articulated vehicle turns as its front draws it instead. `turned` is by how much the vehicle's heading differs from SUMO's, and the rate. Returns, at the end, the height of the rear
 /// axle above the road under the front bumper at the start, its rate, and the pitch of the road.
 pub fn lead(
     state: &mut ModelState,
@@ -146,12 +146,15 @@ pub fn lead(
         let [angle, rate] = *turned;
         let rate = rate - RETURN_PER_S * (2.0 * rate + RETURN_PER_S * angle) * pace * dt_s;
         *turned = [angle + rate * pace * dt_s, rate];
-        let wanted = GuidedPose {
+        let mut wanted = GuidedPose {
             front: target,
             shift: sideways.at(time_s),
             yaw_rad: heading[0] + heading[1] * time_s + turned[0],
             yaw_rate_radps: heading[1] + turned[1] * pace,
         };
+        if vehicle.trailing.count() > 0 {
+            wanted.draw(state, front_m, dt_s);
+        }
         let (next, motion) = follow(state, &wanted, vehicle, dt_s);
         let leans = [BodyLean::of(state, road[2]), BodyLean::of(&next, road_next[2])];
         *row = sub_step(&next, &motion, leans, (road_next[1] - road[1]) / dt_s, 1.0 / dt_s);
@@ -177,6 +180,21 @@ struct GuidedPose {
     shift: ReferencePoint,
     yaw_rad: f64,
     yaw_rate_radps: f64,
+}
+
+impl GuidedPose {
+    /// Turns the body as if it was drawn by its front: SUMO's heading is that of all bodies of the vehicle in one line.
+    fn draw(&mut self, state: &ModelState, front_m: f64, dt_s: f64) {
+        let [x, y] = [0, 1].map(|axis: usize| self.front.position_m[axis] + self.shift.position_m[axis]);
+        let (ahead_m, aside_m) = (x - state.x_m, y - state.y_m);
+        // A body without a rod does not turn.
+        let turn_rad = match front_m > 0.0 {
+            true => wrap_angle(libm::atan2(aside_m, ahead_m) - state.yaw_rad),
+            false => 0.0,
+        };
+        self.yaw_rad = state.yaw_rad + turn_rad;
+        self.yaw_rate_radps = turn_rad / dt_s;
+    }
 }
 
 /// One sub-step, at the end of which the vehicle has the wanted pose.

@@ -5,13 +5,16 @@
 //! ends of the step it moves through. Within the step vehicles follow SUMO's smoothed positions, which puts them half a SUMO step
 //! behind (see [`reference`]). A road user exists from the tick at which SUMO first has it.
 
+use std::collections::BTreeMap;
+
 use ipc_schema::{
     block::{self, BlockError},
     header::MessageHeader,
     traffic::{MetaEvent, TrafficState, VehicleMeta},
-    world::{GUIDED, SubStep, VehicleState, WorldLayout},
+    world::{BODY_SHIFT, GUIDED, SubStep, VehicleState, WorldLayout},
 };
 
+mod articulation;
 pub mod batch;
 pub mod curve;
 pub mod departure;
@@ -41,6 +44,7 @@ use crate::{
     },
     scene::shape::OrientedBox,
 };
+use articulation::TrailingChain;
 use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, path_limits};
 use departure::{ContactCause, Departure};
 use pace::PathLimits;
@@ -91,8 +95,8 @@ pub enum MirrorError {
 
 /// Not in the slab.
 const NOWHERE: u32 = u32::MAX;
-/// Most road users announced in one episode: four bytes are kept for each.
-const MAX_ANNOUNCED: u32 = 1 << 26;
+/// Most road users announced in one episode: four bytes are kept for each, and the bits above number the bodies of a vehicle.
+const MAX_ANNOUNCED: u32 = 1 << BODY_SHIFT;
 
 /// Rows between the road user at hand and one whose path is prefetched; one that is prefetched itself is twice as far away.
 const PATHS_AHEAD: usize = 4;
@@ -110,6 +114,8 @@ pub struct Mirror {
     /// What the vehicles of each model can drive, by its index in the catalogue; empty without a preview.
     limits: Vec<PathLimits>,
     free: Vec<u32>,
+    /// The trailing bodies of articulated vehicles, by dense index.
+    chains: BTreeMap<u32, TrailingChain>,
     /// Road users of the current frame: dense index and place, in ascending order of the index.
     present: Vec<(u32, u32)>,
     /// How many of them have a state in all ticks of the step.
@@ -150,6 +156,7 @@ impl Mirror {
             paths: Vec::new(),
             limits: Vec::new(),
             free: Vec::new(),
+            chains: BTreeMap::new(),
             present: Vec::new(),
             in_whole_step: 0,
             frame: 0,
@@ -274,6 +281,10 @@ impl Mirror {
             self.places.resize(vehicle as usize + 1, NOWHERE);
         }
         self.places[vehicle as usize] = place;
+        let trailing = self.catalogue.at(self.slab[place as usize].model()).trailing;
+        if let Some(chain) = TrailingChain::new(trailing) {
+            self.chains.insert(vehicle, chain);
+        }
         Ok(())
     }
 
@@ -282,6 +293,7 @@ impl Mirror {
             && *place != NOWHERE
         {
             self.free.push(std::mem::replace(place, NOWHERE));
+            self.chains.remove(&vehicle);
         }
     }
 
@@ -300,6 +312,7 @@ impl Mirror {
             self.slab.clear();
             self.paths.clear();
             self.free.clear();
+            self.chains.clear();
             self.present.clear();
             self.in_whole_step = 0;
             self.frame = 0;
@@ -366,7 +379,7 @@ impl Mirror {
         }
     }
 
-    /// Number of road users in tick `tick` (0-based within the SUMO step).
+    /// Number of road users in tick `tick` (0-based within the SUMO step), without trailing bodies.
     #[must_use]
     pub fn count(&self, tick: u32) -> usize {
         if self.is_last(tick) {
@@ -376,6 +389,26 @@ impl Mirror {
         }
     }
 
+    /// Number of trailing bodies in tick `tick`: of the vehicles with the lowest indices, as many as a message has room for.
+    #[must_use]
+    pub fn trailing_count(&self, tick: u32) -> usize {
+        self.chains_of(tick).map(|(_, count)| count).sum()
+    }
+
+    /// The articulated vehicles of a tick whose bodies are in its message, and their numbers of bodies.
+    fn chains_of(&self, tick: u32) -> impl Iterator<Item = (u32, usize)> + '_ {
+        let last = self.is_last(tick);
+        let present = self.chains.iter().filter(move |(vehicle, _)| {
+            let place = self.present.binary_search_by_key(vehicle, |(vehicle, _)| vehicle);
+            place.is_ok_and(|place| last || self.slab[self.present[place].1 as usize].is_in_whole_step())
+        });
+        let mut room = self.settings.most_trailing;
+        present.map_while(move |(vehicle, chain)| {
+            room = room.checked_sub(chain.count())?;
+            Some((*vehicle, chain.count()))
+        })
+    }
+
     fn is_last(&self, tick: u32) -> bool {
         tick + 1 >= self.settings.ticks_per_step
     }
@@ -383,7 +416,8 @@ impl Mirror {
     /// The layout of the message of tick `tick`.
     #[must_use]
     pub fn layout(&self, tick: u32) -> WorldLayout {
-        WorldLayout::new(self.count(tick), self.settings.sub_steps as usize)
+        let sub_steps = self.settings.sub_steps as usize;
+        WorldLayout::with_heroes(self.count(tick), sub_steps, 0, self.trailing_count(tick))
     }
 
     /// Moves all road users through tick `tick` and writes them into `payload`, laid out by [`Mirror::layout`], in ascending
@@ -398,6 +432,7 @@ impl Mirror {
         let [states, rows] = block::split_mut(payload, &[layout.states, layout.sub_steps])?;
         let states: &mut [VehicleState] = cast(states, layout.states.offset)?;
         let rows: &mut [SubStep] = cast(rows, layout.sub_steps.offset)?;
+        let (states, trailing) = states.split_at_mut(self.count(tick));
         let mut place_in_message = 0;
         self.resynchronised.clear();
         self.guidances.clear();
@@ -431,7 +466,31 @@ impl Mirror {
         self.kinematic.advance(tick, &mut context, states, rows);
         self.dynamic.advance(tick, &mut context, states, rows);
         self.resynchronisations += self.resynchronised.len() as u64;
+        self.write_trailing(tick, states, rows, trailing);
         Ok(())
+    }
+
+    /// Moves the trailing bodies behind the road users of a finished tick, and puts vehicles on rails onto them.
+    fn write_trailing(
+        &mut self,
+        tick: u32,
+        states: &mut [VehicleState],
+        rows: &mut [SubStep],
+        mut trailing: &mut [VehicleState],
+    ) {
+        let (per_tick, tick_s) = (self.settings.sub_steps as usize, self.settings.tick_s);
+        let written: Vec<(u32, usize)> = self.chains_of(tick).collect();
+        for (vehicle, count) in written {
+            let row = states.binary_search_by_key(&vehicle, |state| state.vehicle);
+            let (Ok(row), Some(chain)) = (row, self.chains.get_mut(&vehicle)) else {
+                continue;
+            };
+            let (bodies, rest) = std::mem::take(&mut trailing).split_at_mut(count);
+            states[row].trailing = count as u32;
+            let steps = &mut rows[row * per_tick..(row + 1) * per_tick];
+            chain.write_tick(&mut states[row], steps, tick_s, bodies);
+            trailing = rest;
+        }
     }
 
     /// Loads a vehicle into the batch of its model, and advances the batch if it is full.

@@ -178,8 +178,12 @@ impl RoadUser {
                 if let Some(left_m) = lane_change_m {
                     path.change_lane_ahead(left_m);
                 }
-                if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s())
-                    == PathJoin::Broken
+                if path.advance(
+                    &self.before,
+                    &self.now,
+                    self.dimensions.whole_length_m,
+                    settings.step_s(),
+                ) == PathJoin::Broken
                 {
                     path.coast(&self.before, settings.step_s());
                     self.arrival = Arrival::Jumping(ResynchronisationCause::ImpossibleStep);
@@ -203,7 +207,7 @@ impl RoadUser {
         let step = match self.arrival {
             Arrival::Continuing => {
                 self.before = self.now;
-                path.advance(now, self.dimensions.length_m, limits, step_s, &mut self.now)
+                path.advance(now, self.dimensions.whole_length_m, limits, step_s, &mut self.now)
             }
             Arrival::Entering | Arrival::Jumping(_) => None,
         };
@@ -253,7 +257,7 @@ impl RoadUser {
     /// The boxes in which SUMO has it at the mirror's time, a frame more or less, newest first.
     pub fn sumo_boxes(&self, ahead: Option<&PathAhead>) -> Vec<OrientedBox> {
         let VehicleDimensions {
-            length_m,
+            whole_length_m: length_m,
             width_m,
             height_m,
             ..
@@ -519,6 +523,7 @@ impl RoadUser {
             height_m,
             wheelbase_m,
             rear_overhang_m,
+            whole_length_m,
         } = self.dimensions;
         // Overwrites whatever the loan of shared memory contained.
         *out = VehicleState::default();
@@ -530,6 +535,7 @@ impl RoadUser {
         out.length_m = length_m as f32;
         out.width_m = width_m as f32;
         out.height_m = height_m as f32;
+        out.whole_length_m = whole_length_m as f32;
         if !matches!(self.mover, Mover::Person(_)) {
             out.wheelbase_m = wheelbase_m as f32;
             out.rear_overhang_m = rear_overhang_m as f32;

@@ -4,6 +4,7 @@ use ipc_schema::{
     config::{self, PreviewFrames},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader},
     run::RunFile,
+    world::most_trailing,
 };
 
 use super::suites::SuiteRules;
@@ -28,6 +29,8 @@ pub struct MirrorSettings {
     pub suites: Option<SuiteRules>,
     /// An odometer counts the turns of wheels that slip: the world says by how much.
     pub wheel_slip: bool,
+    /// Trailing bodies that a message has room for.
+    pub most_trailing: usize,
 }
 
 impl MirrorSettings {
@@ -69,6 +72,7 @@ impl MirrorSettings {
             hero_driver: run.config.task.driver,
             suites: SuiteRules::of_run(run),
             wheel_slip: run.config.speed_steering.wheel_slip,
+            most_trailing: most_trailing(run.config.traffic.max_road_users as usize),
         }
     }
 

@@ -8,6 +8,7 @@ use ipc_schema::{
 };
 
 use super::{
+    articulation::TrailingBodies,
     dimensions::VehicleDimensions,
     dynamic::DynamicParams,
     kinematic::KinematicParams,
@@ -86,6 +87,8 @@ pub struct SizedModel {
     pub model: MotionModel,
     /// Its size.
     pub dimensions: VehicleDimensions,
+    /// The bodies behind its leading one.
+    pub trailing: TrailingBodies,
     /// Steering-wheel angle by road-wheel angle.
     pub steering_ratio: f64,
 }
@@ -182,7 +185,7 @@ impl ModelCatalogue {
         type_limits: &TypeLimits,
     ) -> SizedModel {
         let set = &self.catalogue.sets()[set];
-        let dimensions = set.dimensions(length, width, height);
+        let (dimensions, trailing) = (set.dimensions(length, width, height), set.trailing(length));
         let (set, limits) = (
             &set.strengthened(type_limits, &dimensions),
             &type_limits.raised(&self.limits),
@@ -201,6 +204,7 @@ impl ModelCatalogue {
         SizedModel {
             model,
             dimensions,
+            trailing,
             steering_ratio: set.steering_ratio,
         }
     }

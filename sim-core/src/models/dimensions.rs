@@ -1,6 +1,6 @@
 //! Size of a vehicle and the place of its axles.
 
-/// Size of a vehicle and the place of its axles.
+/// Size of a vehicle and the place of its axles. Of an articulated vehicle: of its leading body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VehicleDimensions {
     /// Bumper to bumper, metres.
@@ -11,8 +11,10 @@ pub struct VehicleDimensions {
     pub height_m: f64,
     /// Rear axle to front axle, metres.
     pub wheelbase_m: f64,
-    /// Rear axle to rear bumper, metres.
+    /// Rear axle to the rear end of the body, metres; negative if the body ends before the axle.
     pub rear_overhang_m: f64,
+    /// From the front to the end of the last body in a straight line, metres: SUMO's length.
+    pub whole_length_m: f64,
 }
 
 impl VehicleDimensions {

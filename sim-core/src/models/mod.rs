@@ -4,6 +4,7 @@
 //! are free of branches and library calls so that [`crate::mirror::batch`] can run them on many vehicles at once; one vehicle
 //! alone gives the same bits. [`catalogue`] chooses model and parameters of each vehicle.
 
+pub mod articulation;
 pub mod attitude;
 pub mod catalogue;
 pub mod dimensions;

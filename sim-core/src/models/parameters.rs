@@ -4,6 +4,7 @@ use ipc_schema::config::VehicleConfig;
 use serde::Deserialize;
 
 use super::{
+    articulation::{Articulation, TrailingBodies},
     dimensions::VehicleDimensions,
     dynamic::{AIR_KGPM3, GRAVITY_MPS2},
 };
@@ -43,7 +44,10 @@ pub struct ParameterSet {
     pub kinematic: bool,
     /// Longest vehicle that gets this set, metres.
     pub longest_m: f64,
-    /// Bumper to bumper, metres.
+    /// Its further bodies; `None` if it has one.
+    #[serde(default)]
+    pub articulation: Option<Articulation>,
+    /// Bumper to bumper, metres. Of an articulated vehicle: of its leading body, as all that follows but mass, power and drag.
     pub length_m: f64,
     /// Metres.
     pub width_m: f64,
@@ -51,9 +55,9 @@ pub struct ParameterSet {
     pub height_m: f64,
     /// Rear axle to front axle, metres.
     pub wheelbase_m: f64,
-    /// Rear axle to rear bumper, metres.
+    /// Rear axle to the rear end of the body, metres; negative if the body ends before the axle.
     pub rear_overhang_m: f64,
-    /// Mass, kg.
+    /// Mass, kg. Of a vehicle on rails: of one carriage, as power and drag.
     pub mass_kg: f64,
     /// Moment of inertia about the vertical axis through the centre of gravity, kg m².
     pub yaw_inertia_kgm2: f64,
@@ -148,17 +152,44 @@ impl ParameterSet {
         }
     }
 
+    /// SUMO's length of the vehicle that the values belong to, metres: with a trailer that of the whole.
+    #[must_use]
+    pub fn whole_length_m(&self) -> f64 {
+        match self.articulation {
+            Some(Articulation::Trailer { whole_length_m, .. }) => whole_length_m,
+            Some(Articulation::Carriages { .. }) | None => self.length_m,
+        }
+    }
+
     /// Size and axles of a vehicle of SUMO with this set: lengths along the body scale with its length.
     #[must_use]
     pub fn dimensions(&self, length_m: f64, width_m: f64, height_m: f64) -> VehicleDimensions {
-        let length_m = length_m.max(SHORTEST_M);
-        let scale = length_m / self.length_m;
+        let whole_length_m = length_m.max(SHORTEST_M);
+        let (scale, _) = self.bodies(whole_length_m);
         VehicleDimensions {
-            length_m,
+            length_m: match self.articulation {
+                None => whole_length_m,
+                Some(_) => self.length_m * scale,
+            },
             width_m,
             height_m,
             wheelbase_m: self.wheelbase_m * scale,
             rear_overhang_m: self.rear_overhang_m * scale,
+            whole_length_m,
+        }
+    }
+
+    /// The bodies behind the leading one of a vehicle of SUMO's length.
+    #[must_use]
+    pub fn trailing(&self, length_m: f64) -> TrailingBodies {
+        self.bodies(length_m.max(SHORTEST_M)).1
+    }
+
+    /// Factor of the lengths along the leading body, and the bodies behind it.
+    fn bodies(&self, whole_length_m: f64) -> (f64, TrailingBodies) {
+        match &self.articulation {
+            None => (whole_length_m / self.length_m, TrailingBodies::None),
+            Some(articulation) => articulation.sized(whole_length_m, self.length_m),
         }
     }
 

@@ -434,19 +434,20 @@ impl SuspensionTuning {
     }
 }
 
-/// The body's box, without mass of its own.
+/// Least length of the frame behind the rear axle by the wheelbase.
+const LEAST_OVERHANG: f64 = 0.2;
+
+/// The body's box, without mass of its own. It reaches behind the rear axle: a tractor's frame is longer than its cab.
 fn box_of(body: &VehicleDimensions, friction: f64) -> ColliderBuilder {
     let floor = FLOOR_BY_HEIGHT * body.height_m;
+    let rear_m = body.rear_overhang_m.max(LEAST_OVERHANG * body.wheelbase_m);
+    let length_m = body.front_m() + rear_m;
     ColliderBuilder::cuboid(
-        0.5 * body.length_m,
+        0.5 * length_m,
         0.5 * body.width_m,
         0.5 * (body.height_m - floor).max(floor),
     )
-    .translation(Vector::new(
-        0.5 * body.length_m - body.rear_overhang_m,
-        0.0,
-        0.5 * (body.height_m + floor),
-    ))
+    .translation(Vector::new(0.5 * length_m - rear_m, 0.0, 0.5 * (body.height_m + floor)))
     .density(0.0)
     .friction(friction)
 }

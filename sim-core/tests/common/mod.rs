@@ -27,6 +27,7 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
         hero_driver: config::HeroDriver::Actions,
         suites: None,
         wheel_slip: false,
+        most_trailing: 100,
     }
 }
 

@@ -307,6 +307,7 @@ impl MessageExchange {
 
     /// Gives each slot its station; one whose vehicle is new begins with an empty map.
     fn take_slots(&mut self, slots: &[SlotMeasurement], states: &[VehicleState]) {
+        let states = road_users_of(states);
         let before = std::mem::replace(&mut self.slots, slots.len());
         set_slots(&mut self.stations, before, slots.len());
         set_slots(&mut self.activity, before, slots.len());
@@ -631,16 +632,27 @@ fn nearest_views<'a>(
     nearest.extend(all.into_iter().take(count).map(|(_, view)| view));
 }
 
+/// The first of the states of a `world` message: road users without trailing bodies.
+fn road_users_of(states: &[VehicleState]) -> &[VehicleState] {
+    &states[..states.partition_point(|state| state.kind != Kind::Trailing as u32)]
+}
+
 fn size_of(state: &VehicleState) -> VehicleSize {
     let length_m = f64::from(state.length_m);
+    // A person's origin is its centre.
+    let rear_overhang_m = match state.kind == Kind::Person as u32 {
+        true => 0.5 * length_m,
+        false => state.rear_overhang_m.into(),
+    };
+    let behind_m = match state.trailing {
+        0 => 0.0,
+        _ => f64::from(state.whole_length_m) - length_m,
+    };
     VehicleSize {
-        length_m,
+        length_m: length_m + behind_m,
         width_m: state.width_m.into(),
-        // A person's origin is its centre.
-        rear_overhang_m: match state.kind == Kind::Person as u32 {
-            true => 0.5 * length_m,
-            false => state.rear_overhang_m.into(),
-        },
+        rear_overhang_m: rear_overhang_m + behind_m,
+        has_trailer: state.trailing > 0,
     }
 }
 

@@ -82,7 +82,7 @@ impl<'a> Observer<'a> {
         let Self { states, obstacles, .. } = self;
         let (bodies, yaw_rad) = (obstacles.bodies(), self.yaw_rad);
         let mut near = Vec::new();
-        obstacles.road_users_near(&Bounds::about(self.centre_m, spec.range_m), &mut near);
+        obstacles.bodies_near(&Bounds::about(self.centre_m, spec.range_m), &mut near);
         let object = |row: &u32| {
             let (body, other) = (&bodies[*row as usize], &states[*row as usize]);
             let [dx, dy] = [0, 1].map(|axis: usize| body.centre_m[axis] - self.centre_m[axis]);

@@ -13,6 +13,8 @@ pub(super) const DELTA_TIME: [i64; 2] = [0, 65_535];
 const DIRECTION: [i64; 2] = [0, 2];
 const LENGTH: [i64; 2] = [1, 1023];
 const TRAILER: [i64; 2] = [0, 4];
+/// `trailerPresentWithKnownLength`; 0 is `noTrailerPresent`.
+const TRAILER_OF_KNOWN_LENGTH: i64 = 1;
 const WIDTH: [i64; 2] = [1, 62];
 const ACCELERATION: [i64; 2] = [-160, 161];
 const ACCELERATION_CONFIDENCE: [i64; 2] = [0, 102];
@@ -57,8 +59,10 @@ pub struct Cam {
     pub speed_cmps: Option<u16>,
     /// Half of the interval that has the speed with 95 %, cm/s.
     pub speed_confidence: Option<u8>,
-    /// Bumper to bumper, 10 cm.
+    /// Front to rear, trailing bodies included, 10 cm.
     pub length_10cm: u16,
+    /// A trailer is present, and the length includes it.
+    pub has_trailer: bool,
     /// 10 cm.
     pub width_10cm: u8,
     /// Longitudinal acceleration, 0.1 m/s².
@@ -116,8 +120,8 @@ impl Cam {
         // Forward.
         out.integer(0, DIRECTION);
         out.integer(self.length_10cm.into(), LENGTH);
-        // No trailer.
-        out.integer(0, TRAILER);
+        let trailer = if self.has_trailer { TRAILER_OF_KNOWN_LENGTH } else { 0 };
+        out.integer(trailer, TRAILER);
         out.integer(self.width_10cm.into(), WIDTH);
         out.integer(
             self.acceleration.map_or(161, |value| i64::from(value).min(160)),
@@ -183,7 +187,7 @@ fn read_high_frequency(input: &mut BitReader) -> Result<Cam, MessageError> {
     let speed_confidence = input.integer("speedConfidence", CONFIDENCE)?;
     input.integer("driveDirection", DIRECTION)?;
     let length_10cm = input.integer("vehicleLengthValue", LENGTH)? as u16;
-    input.integer("vehicleLengthConfidenceIndication", TRAILER)?;
+    let trailer = input.integer("vehicleLengthConfidenceIndication", TRAILER)?;
     let width_10cm = input.integer("vehicleWidth", WIDTH)? as u8;
     let acceleration = input.integer("longitudinalAccelerationValue", ACCELERATION)?;
     input.integer("longitudinalAccelerationConfidence", ACCELERATION_CONFIDENCE)?;
@@ -203,6 +207,7 @@ fn read_high_frequency(input: &mut BitReader) -> Result<Cam, MessageError> {
         speed_cmps: known(speed, 16_383, |value| value as u16),
         speed_confidence: known(speed_confidence, 127, |value| value as u8),
         length_10cm,
+        has_trailer: trailer == TRAILER_OF_KNOWN_LENGTH,
         width_10cm,
         acceleration: known(acceleration, 161, |value| value as i16),
         yaw_rate: known(yaw_rate, 32_767, |value| value as i16),

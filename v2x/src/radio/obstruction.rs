@@ -2,7 +2,7 @@
 
 use std::ops::{ControlFlow, Range};
 
-use ipc_schema::world::VehicleState;
+use ipc_schema::{traffic::Kind, world::VehicleState};
 use sim_core::scene::{
     Grid, Scene,
     shape::{Bounds, OrientedBox, Point, cross, dot, edges, from_to},
@@ -78,6 +78,8 @@ pub struct Obstacles {
     walls: Vec<BuildingWall>,
     building_grid: Grid,
     bodies: Vec<OrientedBox>,
+    /// How many of `bodies` are road users; those behind them are trailing bodies.
+    road_users: usize,
     /// By row, as `bodies`.
     circles: Vec<RoadUserCircle>,
     vehicles: Grid,
@@ -89,7 +91,7 @@ pub fn body_of(state: &VehicleState) -> OrientedBox {
     let (sin, cos) = libm::sincos(state.yaw_rad);
     let half_length_m = 0.5 * f64::from(state.length_m);
     // From the rear axle; a person's origin is its centre.
-    let ahead_m = match state.kind == ipc_schema::traffic::Kind::Person as u32 {
+    let ahead_m = match state.kind == Kind::Person as u32 {
         true => 0.0,
         false => half_length_m - f64::from(state.rear_overhang_m),
     };
@@ -125,8 +127,9 @@ impl Obstacles {
         obstacles
     }
 
-    /// Takes the road users of a tick.
+    /// Takes the road users of a tick, and the trailing bodies behind them.
     pub fn update(&mut self, states: &[VehicleState]) {
+        self.road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
         self.bodies.clear();
         self.bodies.extend(states.iter().map(body_of));
         self.circles.clear();
@@ -145,9 +148,15 @@ impl Obstacles {
         &self.bodies
     }
 
-    /// Rows of the road users whose bounds may meet `bounds`, ascending, into `found`.
-    pub fn road_users_near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
+    /// Rows of the bodies whose bounds may meet `bounds`, ascending, into `found`.
+    pub fn bodies_near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
         self.vehicles.near(bounds, found);
+    }
+
+    /// The same of road users alone, whose trailing bodies do not count.
+    pub fn road_users_near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
+        self.bodies_near(bounds, found);
+        found.retain(|row| (*row as usize) < self.road_users);
     }
 
     /// What is between two antennas.

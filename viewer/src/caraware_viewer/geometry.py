@@ -39,6 +39,17 @@ def body_radii_m(states: NDArray[np.void]) -> NDArray[np.float32]:
     return radius_m.astype(np.float32)
 
 
+def kinds(states: NDArray[np.void]) -> NDArray[np.uint32]:
+    """Kinds `[n]` by which bodies are coloured: a trailing body has that of its vehicle, if that is among them."""
+    kinds: NDArray[np.uint32] = states["kind"].copy()
+    trailing = np.flatnonzero(kinds == wire.TRAILING)
+    if len(trailing):
+        leading = {int(state["vehicle"]): int(state["kind"]) for state in states[states["trailing"] > 0]}
+        owners = states["vehicle"][trailing] & ((1 << wire.BODY_SHIFT) - 1)
+        kinds[trailing] = [leading.get(int(owner), wire.OTHER) for owner in owners]
+    return kinds
+
+
 def blinkers_m(states: NDArray[np.void]) -> NDArray[np.float32]:
     """Positions of the blinkers that are on, `[m, 2]`: the front and rear corners of that side."""
     left = states[states["signals"] & (BLINKER_LEFT | BLINKER_BOTH) != 0]
@@ -48,8 +59,8 @@ def blinkers_m(states: NDArray[np.void]) -> NDArray[np.float32]:
 
 
 def brake_lights_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Positions of the brake lights that are on, `[m, 2]`: two at the rear."""
-    braking = states[(states["signals"] & BRAKE != 0) & (states["kind"] != wire.PERSON)]
+    """Positions of the brake lights that are on, `[m, 2]`: two at the rear of each last body."""
+    braking = states[(states["signals"] & BRAKE != 0) & (states["kind"] != wire.PERSON) & (states["trailing"] == 0)]
     return _in_world(braking, np.array([[0, 0.7], [0, -0.7]])).reshape(-1, 2)
 
 

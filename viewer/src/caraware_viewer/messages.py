@@ -93,6 +93,7 @@ def _draw_links(
     """Draws a line to each station that the vehicle knows something from: the fresher, the brighter."""
     start = np.array([] if followed is None else [followed], states.dtype)
     own, heard_from, ages_s = station_of(start["id_hash"]), ids[:, 1], objects[:, 7]
+    states = states[states["kind"] != wire.TRAILING]
     places_m = dict(zip(station_of(states["id_hash"]).tolist(), geometry.centres_m(states)[:, :2], strict=True))
     # A station that is no road user, such as a roadside unit, is where it says that it is.
     itself = ids[:, 0] == heard_from

@@ -14,7 +14,7 @@ from caraware_viewer.picture import Picture
 
 OF_FOLLOWED = "cameras/followed"
 """Path of the camera of the followed vehicle."""
-FULL_SAMPLE = 6_249
+FULL_SAMPLE = 5_920
 """Road users in a frame that may leave some out."""
 _ROADSIDE = 1 << 30
 """Bit of `vehicle` of a carrier beside the road."""

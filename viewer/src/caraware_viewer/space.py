@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from caraware_viewer import geometry, wire
+from caraware_viewer import geometry
 from caraware_viewer.canvas import Canvas
 from caraware_viewer.top import CONTACT_COLOR, KIND_COLORS, light_colors, route_colors
 
@@ -41,7 +41,7 @@ def draw_space(canvas: Canvas, states: NDArray[np.void], centre: np.void | None)
         centers=geometry.centres_m(shown),
         half_sizes=np.column_stack([shown["length_m"], shown["width_m"], shown["height_m"]]) / 2,
         quaternions=geometry.quaternions(shown["yaw_rad"]),
-        colors=KIND_COLORS[np.minimum(shown["kind"], wire.HERO)],
+        colors=KIND_COLORS[geometry.kinds(shown)],
         fill_mode="solid",
     )
     canvas.log(VEHICLES, boxes)

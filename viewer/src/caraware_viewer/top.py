@@ -50,10 +50,10 @@ def draw_road_users(
 ) -> None:
     """Draws boxes with an arrow that points forward, blinkers, brake lights, names, and in a crowd dots."""
     marked = states[detail.marked]
-    mark_colors = KIND_COLORS[np.minimum(marked["kind"], wire.HERO)]
+    mark_colors = KIND_COLORS[geometry.kinds(marked)]
     canvas.points(MARKS, np.column_stack([marked["x_m"], marked["y_m"]]), mark_colors, detail.mark_px, 19.0)
     states = states[detail.shaped]
-    colors = KIND_COLORS[np.minimum(states["kind"], wire.HERO)]
+    colors = KIND_COLORS[geometry.kinds(states)]
     outlines = on_screen(geometry.outlines_m(states))
     canvas.log(OUTLINES, rr.LineStrips2D(outlines, colors=colors, radii=rr.Radius.ui_points(0.8), draw_order=21.0))
     bodies, filled = on_screen(geometry.bodies_m(states)), colors & 0xFFFFFF00 | BODY_ALPHA

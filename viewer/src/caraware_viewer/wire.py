@@ -18,8 +18,11 @@ from caraware_viewer.layout import ALIGNMENT, DIMENSIONS, RECORDS, SCHEMA_VERSIO
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
 
-CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
+CAV, OTHER, PERSON, HERO, TRAILING = 0, 1, 2, 3, 4
 """Values of `VehicleState.kind`."""
+
+BODY_SHIFT = 25
+"""First bit of `VehicleState.vehicle` that numbers the trailing bodies of a vehicle, from 1 on."""
 
 
 def sensor_bit(name: str) -> int:
@@ -99,7 +102,12 @@ class World:
 
     header: Header
     states: NDArray[np.void]
-    """`VEHICLE_STATE [count]`."""
+    """`VEHICLE_STATE [count]`: road users, and behind them the trailing bodies of articulated vehicles."""
+
+    @property
+    def road_users(self) -> NDArray[np.void]:
+        """`VEHICLE_STATE [header.rows]`: road users alone."""
+        return self.states[: self.header.rows]
 
 
 @dataclass(frozen=True)

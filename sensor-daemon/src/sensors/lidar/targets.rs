@@ -49,36 +49,49 @@ pub(in crate::sensors) struct MovingTarget {
 #[derive(Debug, Clone, Default)]
 pub struct Targets {
     pub(in crate::sensors) movers: Vec<MovingTarget>,
-    /// How many of `movers` are road users; those behind them are carriers beside the road, which nothing sees.
+    /// How many of `movers` are bodies of road users; those behind them are carriers beside the road, which nothing sees.
     pub(in crate::sensors) road_users: usize,
     /// Poses at the ends of sub-steps, road user by road user.
     knots: Vec<Knot>,
     pub(in crate::sensors) sub_steps: usize,
+    /// Length of a tick, seconds; 0 where trailing bodies stand still.
+    tick_s: f64,
     /// Centre and reach of each road user, for the test of distance.
     pub(in crate::sensors) near: Vec<[f64; 3]>,
 }
 
 impl Targets {
-    /// Replaces the targets by those of a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. With `k` = 0 nothing
-    /// moves.
+    /// No targets, in ticks of this length: trailing bodies move through them.
+    #[must_use]
+    pub fn in_ticks_of(tick_s: f64) -> Self {
+        Self {
+            tick_s,
+            ..Self::default()
+        }
+    }
+
+    /// Replaces the targets by those of a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. Trailing bodies,
+    /// behind the road users, have no sub-steps: they move evenly through the tick. With `k` = 0 nothing moves.
     pub fn update(&mut self, states: &[VehicleState], sub_steps: &[SubStep], k: usize) {
-        let k = if sub_steps.len() < states.len() * k { 0 } else { k };
+        let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+        let k = if sub_steps.len() < road_users * k { 0 } else { k };
         self.sub_steps = k;
         self.knots.clear();
-        self.knots.extend(sub_steps[..states.len() * k].iter().map(|step| {
-            [
-                step.dx_m,
-                step.dy_m,
-                step.dz_m,
-                step.dyaw_rad,
-                step.roll_rad,
-                step.pitch_rad,
-            ]
-        }));
+        self.knots.extend(sub_steps[..road_users * k].iter().map(knot));
         self.movers.clear();
         self.near.clear();
+        let mut even: Vec<SubStep> = Vec::new();
         for (row, state) in states.iter().enumerate() {
-            let mover = MovingTarget::new(state, &sub_steps[row * k..(row + 1) * k]);
+            let steps = match row < road_users {
+                true => &sub_steps[row * k..(row + 1) * k],
+                false => {
+                    even.clear();
+                    even.extend(even_steps(state, k, self.tick_s));
+                    self.knots.extend(even.iter().map(knot));
+                    &even[..]
+                }
+            };
+            let mover = MovingTarget::new(state, steps);
             let [x, y] = mover.centre_m(&mover.end);
             self.near.push([x, y, mover.radius_m + mover.travel_m]);
             self.movers.push(mover);
@@ -135,6 +148,45 @@ impl Targets {
         let level = |knot: &Knot| knot[4] == 0.0 && knot[5] == 0.0;
         knots.iter().all(level) && mover.rates[4] == 0.0 && mover.rates[5] == 0.0
     }
+}
+
+#[inline(always)]
+fn knot(step: &SubStep) -> Knot {
+    [
+        step.dx_m,
+        step.dy_m,
+        step.dz_m,
+        step.dyaw_rad,
+        step.roll_rad,
+        step.pitch_rad,
+    ]
+}
+
+/// The sub-steps of a body that moves evenly through a tick, as its state says.
+fn even_steps(state: &VehicleState, k: usize, tick_s: f64) -> impl Iterator<Item = SubStep> {
+    let [along, left, up] = state.velocity_body_mps.map(f64::from);
+    let [_, _, yaw_rate] = state.angular_rate_body_radps.map(f64::from);
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    let rates = [along * cos - left * sin, along * sin + left * cos, up, yaw_rate];
+    let (roll_rad, pitch_rad) = (state.roll_rad, state.pitch_rad);
+    (1..=k).map(move |number| {
+        let left_s = tick_s * (k - number) as f64 / k as f64;
+        let [dx_m, dy_m, dz_m, dyaw_rad] = rates.map(|rate| (-rate * left_s) as f32);
+        // Velocities in the axes of this time, which turn with the body.
+        let (sin, cos) = libm::sincos(state.yaw_rad + f64::from(dyaw_rad));
+        SubStep {
+            dx_m,
+            dy_m,
+            dz_m,
+            dyaw_rad,
+            roll_rad,
+            pitch_rad,
+            speed_mps: (rates[0] * cos + rates[1] * sin) as f32,
+            lateral_speed_mps: (rates[1] * cos - rates[0] * sin) as f32,
+            angular_rate_body_radps: [0.0, 0.0, yaw_rate as f32],
+            ..SubStep::default()
+        }
+    })
 }
 
 impl MovingTarget {

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
+
 from caraware.data.recording import Recording, RecordingError
 from caraware.ipc.names import Names
 
@@ -16,6 +18,12 @@ class Kind(IntEnum):
     OTHER = 1
     PERSON = 2
     HERO = 3
+    TRAILING = 4
+    """Trailing body of an articulated vehicle, with the vehicle's hash."""
+
+
+BODY_SHIFT = 25
+"""First bit of `VehicleState.vehicle` that numbers the trailing bodies of a vehicle, from 1 on."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,11 @@ class RoadUsers:
             self._names = Names(recording.run)
         except (RecordingError, KeyError):
             self._names = None
+
+    def body_name(self, state: np.void) -> str:
+        """SUMO's id of a road user (`VehicleState`); of a trailing body that of its vehicle, a slash and its place."""
+        name, place = self.of(state["id_hash"]).id, int(state["vehicle"]) >> BODY_SHIFT
+        return f"{name}/{place}" if place else name
 
     def of(self, id_hash: int) -> RoadUser:
         """The road user; one that was not announced has its hash as id, if its id is not known otherwise."""

@@ -23,7 +23,8 @@ class RoadUserStates:
     tick: int
     sim_time_ns: int
     states: NDArray[np.void]
-    """`VEHICLE_STATE [count]`, read-only, by ascending `vehicle`, which is that of the observation."""
+    """`VEHICLE_STATE [count]`, read-only: road users by ascending `vehicle`, which is that of the observation, and
+    behind them the trailing bodies of articulated vehicles, whose `kind` is 4."""
 
     @classmethod
     def of(cls, native: _native.SightMessage) -> RoadUserStates:

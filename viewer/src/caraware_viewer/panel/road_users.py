@@ -96,7 +96,7 @@ class LiveRun:
         return RoadUsers(
             tick=world.header.tick,
             episode=world.header.episode,
-            users=[self._user(state) for state in world.states if int(state["id_hash"]) in self._picture.names],
+            users=[self._user(state) for state in world.road_users if int(state["id_hash"]) in self._picture.names],
         )
 
     def close(self) -> None:

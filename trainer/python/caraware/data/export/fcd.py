@@ -37,6 +37,7 @@ def write_fcd(recording: Recording, episode: Episode, path: Path) -> None:
             time_s = float(headers["sim_time_ns"][message]) * 1e-9
             file.write(f'    <timestep time="{time_s:.2f}">\n')
             states = np.asarray(recording.at("world", int(message), "states"))
+            states = states[states["kind"] != Kind.TRAILING]
             (x_m, y_m), angles = front_m(states), angle_deg(states["yaw_rad"])
             speeds = np.hypot(states["velocity_body_mps"][:, 0], states["velocity_body_mps"][:, 1])
             slopes = np.rad2deg(states["pitch_rad"])

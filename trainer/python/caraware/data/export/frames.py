@@ -137,7 +137,7 @@ class Frame:
     """Number of the vehicle within its episode, or `ROADSIDE` and the place of a carrier beside the road."""
     tick: int
     states: Array
-    """All road users (`VehicleState`)."""
+    """All road users (`VehicleState`), and behind them the trailing bodies of articulated vehicles."""
     own: np.void
     """The state of the carrier (`VehicleState`); beside the road it has a place and a heading, and is at rest."""
     main: LidarScan | None
@@ -165,7 +165,7 @@ class Frame:
         return (*self.scans, *self.images, *self.radars)
 
     def labelled(self) -> list[np.void]:
-        """The states of all other road users that a LIDAR, a camera or a radar of this frame shows."""
+        """The states of all other bodies of road users that a LIDAR, a camera or a radar of this frame shows."""
         shown: set[int] = set().union(*(image.seen for image in self.images))
         for scan in self.scans:
             shown.update(np.unique(scan.points["object"]).tolist())

@@ -50,7 +50,7 @@ CLASSES = {
     "Pedestrian": ("pedestrian", "wheelchair"),
     "Misc": ("bus", "coach", "motorcycle", "moped", "scooter", "ship", "container", "aircraft", "drone"),
 }
-"""KITTI's classes by SUMO's; the classes that are missing are cars."""
+"""KITTI's classes by SUMO's; the classes that are missing are cars. Trailers are `Misc`, as there."""
 
 LARGELY_HIDDEN, PARTLY_HIDDEN = 0.25, 0.6
 """Share of the pixels of a road user's box that show it, below which KITTI's `occluded` is 2 and 1."""
@@ -174,6 +174,8 @@ def kitti_class(state: np.void, vehicle_class: str) -> str:
     if state["kind"] == Kind.PERSON:
         return "Pedestrian"
     vehicle_class = vehicle_class or class_by_size(state)
+    if vehicle_class in CLASSES["Truck"] and state["kind"] == Kind.TRAILING:
+        return "Misc"
     return next((name for name, classes in CLASSES.items() if vehicle_class in classes), "Car")
 
 

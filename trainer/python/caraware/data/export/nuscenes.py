@@ -45,7 +45,7 @@ from caraware.data.export.scans import (
     vehicle_pose,
 )
 from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours, left_out
-from caraware.data.names import Kind, RoadUsers
+from caraware.data.names import BODY_SHIFT, Kind, RoadUsers
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
 
@@ -71,9 +71,11 @@ CATEGORIES = {
     "vehicle.emergency.ambulance": ("emergency",),
     "vehicle.emergency.police": ("authority",),
     "vehicle.motorcycle": ("motorcycle", "moped", "scooter"),
+    "vehicle.trailer": (),
     "vehicle.truck": ("truck", "trailer"),
 }
-"""nuScenes' categories by SUMO's classes; the classes that are missing are cars. Trams have no category there."""
+"""nuScenes' categories by SUMO's classes; the classes that are missing are cars. Trams have no category there.
+As there, each body of an articulated bus or tram has a box, and so have tractor and trailer."""
 
 ATTRIBUTES = {
     "vehicle": ("vehicle.moving", "vehicle.stopped"),
@@ -120,6 +122,10 @@ def category(state: np.void, vehicle_class: str) -> str:
     if state["kind"] == Kind.PERSON and vehicle_class != "wheelchair":
         return "human.pedestrian.adult"
     vehicle_class = vehicle_class or class_by_size(state)
+    if vehicle_class in CATEGORIES["vehicle.bus.rigid"] and (state["trailing"] or state["kind"] == Kind.TRAILING):
+        return "vehicle.bus.bendy"
+    if vehicle_class in CATEGORIES["vehicle.truck"] and state["kind"] == Kind.TRAILING:
+        return "vehicle.trailer"
     return next((name for name, classes in CATEGORIES.items() if vehicle_class in classes), "vehicle.car")
 
 
@@ -303,7 +309,8 @@ class _Scene:
         vehicle = int(state["vehicle"])
         name = category(state, self.users.of(state["id_hash"]).vehicle_class)
         # Numbers of vehicles are used again, ids are not.
-        instance, row = self.token("instance", state["id_hash"]), self.token("box", sample, state["id_hash"])
+        body = (state["id_hash"], *([place] if (place := vehicle >> BODY_SHIFT) else []))
+        instance, row = self.token("instance", *body), self.token("box", sample, *body)
         world_from_box = upright_pose(state)
         centre = world_from_box @ (box_middle(state) + np.array([0, 0, float(state["height_m"]) / 2, 0]))
         self._link(

@@ -49,6 +49,7 @@ COLOURS = {
     Kind.OTHER: (0.6, 0.6, 0.6),
     Kind.PERSON: (0.9, 0.62, 0.0),
     Kind.HERO: (0.8, 0.47, 0.65),
+    Kind.TRAILING: (0.45, 0.45, 0.5),
 }
 """Red, green and blue of the boxes, 0 … 1."""
 
@@ -88,7 +89,7 @@ class Box:
     """The box of a road user."""
 
     id: str
-    """SUMO's id."""
+    """SUMO's id; of a trailing body with a slash and its place."""
     vehicle: int
     kind: Kind
     world_from_box: Float64Array
@@ -223,7 +224,7 @@ def _box(state: np.void, users: RoadUsers) -> Box:
     middle = np.eye(4)
     middle[:3, 3] = box_middle(state)[:3] + np.array([0, 0, float(state["height_m"]) / 2])
     return Box(
-        users.of(state["id_hash"]).id,
+        users.body_name(state),
         int(state["vehicle"]),
         Kind(int(state["kind"])),
         upright_pose(state) @ middle,
