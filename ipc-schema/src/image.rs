@@ -134,8 +134,8 @@ pub struct ImageHead {
     pub lost_events: u32,
     /// Lens distortion: k1, k2, p1, p2, k3 of Brown's model, as in OpenCV; zeros of a pinhole.
     pub distortion: [f32; 5],
-    /// Zero.
-    pub reserved: u32,
+    /// From the readout of the first row to that of the last one, which is the end of the tick, seconds; 0 of a global shutter.
+    pub readout_s: f32,
 }
 
 /// A road user of which an image shows a pixel at least, with the fields of KITTI's labels.

@@ -252,7 +252,7 @@ pub fn table() -> Vec<TypeLayout> {
             sensor,
             lost_events,
             distortion,
-            reserved
+            readout_s
         }),
         layout!(BrightnessEvent {
             time_us,

@@ -63,6 +63,8 @@ pub struct CameraImaging {
     /// By number.
     cameras: BTreeMap<u32, NumberedCamera>,
     targets: Targets,
+    /// Sub-steps of a tick that a camera needs; 0 if all show its end alone.
+    sub_steps: usize,
     seen: CameraTargets,
     scratch: CameraScratch,
     objects: Vec<SeenObject>,
@@ -87,6 +89,8 @@ struct NumberedCamera {
     noise_key: u64,
     /// Ticks since which the optical flow counts; 0 without it.
     flow_ticks: u64,
+    /// From the readout of the first row to that of the last one, seconds; 0 = global shutter.
+    readout_s: f32,
     /// Change of brightness that is an event, and most events of an image; `None` without events.
     events: Option<(f32, usize)>,
 }
@@ -193,6 +197,7 @@ impl EventVision {
             let shot = CameraShot {
                 noise: None,
                 targets: within,
+                tick: None,
                 carrier: Some(unit.row),
                 pose,
                 past: None,
@@ -279,7 +284,7 @@ impl CameraImaging {
         let units = config.sensor_units(SensorKind::Camera);
         let cameras = units.iter().map(|unit| {
             let camera = config.with_unit(unit).camera;
-            let params = CameraParams::from(&camera);
+            let params = CameraParams::new(&camera, config.run.tick_s);
             let maps = sights
                 .iter()
                 .map(|sight| CameraModel::in_sight(&params, Arc::clone(sight)));
@@ -296,6 +301,7 @@ impl CameraImaging {
                 },
                 noise_key: unit.noise_key(),
                 flow_ticks: if camera.flow { u64::from(unit.period_ticks) } else { 0 },
+                readout_s: camera.readout_s as f32,
                 events: camera
                     .events
                     .then(|| (camera.event_threshold as f32, most_events(&camera))),
@@ -304,13 +310,16 @@ impl CameraImaging {
         });
         let cameras: BTreeMap<u32, NumberedCamera> = cameras.collect();
         let most = cameras.values().map(|camera| camera.flow_ticks).max().unwrap_or(0) as usize;
-        let sub_steps = match cameras.values().any(|camera| camera.events.is_some()) {
+        let sub_steps_if = |is_needed: fn(&NumberedCamera) -> bool| match cameras.values().any(is_needed) {
             true => config.run.sub_steps as usize,
             false => 0,
         };
+        let vision_steps = sub_steps_if(|camera| camera.events.is_some());
+        let sub_steps = vision_steps.max(sub_steps_if(|camera| camera.readout_s > 0.0));
         Self {
             cameras,
             targets: Targets::in_ticks_of(config.run.tick_s),
+            sub_steps,
             seen: CameraTargets::default(),
             scratch: CameraScratch::default(),
             objects: Vec::new(),
@@ -320,7 +329,7 @@ impl CameraImaging {
             },
             vision: EventVision {
                 sub_step_us: 1e6 * config.run.tick_s / f64::from(config.run.sub_steps),
-                sub_steps,
+                sub_steps: vision_steps,
                 ..EventVision::default()
             },
             due: Vec::new(),
@@ -362,7 +371,7 @@ impl CameraImaging {
         // The optical flow of a later image needs the poses of this tick, whether a camera is due or not.
         let keeps_poses = self.past.most > 0;
         if !due.is_empty() || keeps_poses {
-            self.targets.update(states, sub_steps, self.vision.sub_steps);
+            self.targets.update(states, sub_steps, self.sub_steps);
         }
         if !due.is_empty() {
             self.seen.update(&self.targets);
@@ -415,6 +424,7 @@ impl CameraImaging {
                 header.tick,
             ),
             targets: seen,
+            tick: Some(&self.targets),
             carrier: Some(unit.row),
             pose,
             past: self.past.since(header, numbered, camera, carrier, &pose),
@@ -450,7 +460,7 @@ impl CameraImaging {
             sensor: unit.sensor,
             lost_events: lost_events as u32,
             distortion: numbered.distortion,
-            reserved: 0,
+            readout_s: numbered.readout_s,
         }));
         let hashed = hashed_head(head, offset_of!(ImageHead, sensor), unit.sensor);
         self.totals

@@ -24,6 +24,8 @@ pub struct CameraConfig {
     pub range_m: f64,
     /// Lens distortion: k1, k2, p1, p2, k3 of Brown's model, as in OpenCV; zeros = a pinhole.
     pub distortion: [f64; 5],
+    /// From the readout of the first row to that of the last one, which is the end of the tick, seconds; 0 = global shutter.
+    pub readout_s: f64,
     /// Where it is mounted: x, y, z from the centre of the rear axle on the ground (metres), then roll, pitch (nose up), yaw (radians).
     pub mount: [f64; 6],
     /// Images have depths.

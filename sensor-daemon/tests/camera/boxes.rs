@@ -3,7 +3,7 @@
 use sensor_daemon::sensors::camera::SemanticLabel;
 
 use crate::{
-    CameraModel, CameraParams, CameraScratch, VehicleState, car, config, lidar_city,
+    CameraModel, CameraParams, CameraScratch, Taken, VehicleState, car, config, lidar_city,
     lidar_city::{Moves, traffic},
     params, scene_of, take,
 };
@@ -18,33 +18,39 @@ fn visible_boxes_are_those_counted_from_the_instances() {
         let params = params(160, 100, [1.5, 0.0, 1.6, 0.0, 0.02, 0.1]);
         let camera = CameraModel::new(&params, &config(), &scene);
         let (taken, _) = take(&camera, &states, row, &mut scratch);
-        for state in &states {
-            let mut counted = (0_u32, [u16::MAX, u16::MAX, 0, 0]);
-            for (pixel, _) in taken
-                .instance
-                .iter()
-                .enumerate()
-                .filter(|(_, seen)| **seen == state.vehicle)
-            {
-                let (u, v) = ((pixel % 160) as u16, (pixel / 160) as u16);
-                let [left, top, right, bottom] = counted.1;
-                counted = (counted.0 + 1, [left.min(u), top.min(v), right.max(u), bottom.max(v)]);
-            }
-            let found = taken.objects.iter().find(|seen| seen.object == state.vehicle);
-            let found = found.map_or((0, [u16::MAX, u16::MAX, 0, 0]), |seen| {
-                (seen.visible_px, seen.visible_box_px)
-            });
-            assert_eq!(found, counted, "row {row}, {}", state.vehicle);
-        }
-        for seen in &taken.objects {
-            boxes += 1;
-            let [left, top, right, bottom] = seen.full_box_px;
-            let [l, t, r, b] = seen.visible_box_px.map(f32::from);
-            let holds = left <= l + 0.51 && top <= t + 0.51 && right >= r + 0.49 && bottom >= b + 0.49;
-            assert!(holds, "the full box holds the visible one: {seen:?}");
-        }
+        boxes += check(&taken, &states, 160, 0.01);
     }
     assert!(boxes > 30, "{boxes}");
+}
+
+/// Checks the list of an image against its instances. Full boxes hold the visible ones but for `slack_px`. Returns the length of the list.
+pub fn check(taken: &Taken, states: &[VehicleState], width: usize, slack_px: f32) -> usize {
+    for state in states {
+        let mut counted = (0_u32, [u16::MAX, u16::MAX, 0, 0]);
+        for (pixel, _) in taken
+            .instance
+            .iter()
+            .enumerate()
+            .filter(|(_, seen)| **seen == state.vehicle)
+        {
+            let (u, v) = ((pixel % width) as u16, (pixel / width) as u16);
+            let [left, top, right, bottom] = counted.1;
+            counted = (counted.0 + 1, [left.min(u), top.min(v), right.max(u), bottom.max(v)]);
+        }
+        let found = taken.objects.iter().find(|seen| seen.object == state.vehicle);
+        let found = found.map_or((0, [u16::MAX, u16::MAX, 0, 0]), |seen| {
+            (seen.visible_px, seen.visible_box_px)
+        });
+        assert_eq!(found, counted, "{}", state.vehicle);
+    }
+    for seen in &taken.objects {
+        let [left, top, right, bottom] = seen.full_box_px;
+        let [l, t, r, b] = seen.visible_box_px.map(f32::from);
+        let (inner, outer) = (0.5 + slack_px, 0.5 - slack_px);
+        let holds = left <= l + inner && top <= t + inner && right >= r + outer && bottom >= b + outer;
+        assert!(holds, "the full box holds the visible one: {seen:?}");
+    }
+    taken.objects.len()
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Optical flow in closed form, and against the earlier image itself.
 
 use crate::{
-    CameraModel, CameraParams, CameraScratch, GROUND, VehicleState, car, config, lidar_city,
+    CameraModel, CameraParams, CameraScratch, GROUND, Taken, VehicleState, car, config, lidar_city,
     lidar_city::{Moves, traffic},
     params, rectangle, scene_of, take, take_since,
 };
@@ -116,24 +116,30 @@ fn agrees_with_the_earlier_image(distortion: [f64; 5]) {
     };
     let camera = CameraModel::new(&params, &config(), &lidar_city::scene(500, 1));
     let mut scratch = CameraScratch::default();
-    let (mut compared, mut same, mut of_users) = (0, 0, 0);
-    for tick in 0..8 {
+    agrees(200, |row, tick| {
         let [before, now]: [Vec<VehicleState>; 2] =
             [tick, tick + 1].map(|tick| traffic(200, 60, Moves::Wildly, tick, 2).0);
-        for row in 0..4 {
-            let (earlier, _) = take(&camera, &before, row, &mut scratch);
-            let (taken, _) = take_since(&camera, Some(&before), &now, row, &mut scratch);
-            for (pixel, flow_px) in taken.flow_px.iter().enumerate() {
-                let place = [pixel % 200, pixel / 200].map(|part| part as f32);
-                let [u, v] = [0, 1].map(|axis: usize| (place[axis] - flow_px[axis]).round());
-                if !(0.0..200.0).contains(&u) || !(0.0..120.0).contains(&v) {
-                    continue;
-                }
-                compared += 1;
-                let instance = taken.instance[pixel];
-                of_users += u32::from(instance < 1 << 30);
-                same += u32::from(earlier.instance[v as usize * 200 + u as usize] == instance);
+        let (earlier, _) = take(&camera, &before, row, &mut scratch);
+        [earlier, take_since(&camera, Some(&before), &now, row, &mut scratch).0]
+    });
+}
+
+/// Checks the flow of the second of two images, which are taken from a row and begin at a tick.
+pub fn agrees(width: usize, mut images: impl FnMut(usize, u64) -> [Taken; 2]) {
+    let (mut compared, mut same, mut of_users) = (0, 0, 0);
+    for (tick, row) in (0..8).flat_map(|tick| (0..4).map(move |row| (tick, row))) {
+        let [earlier, taken] = images(row, tick);
+        let size = [width, taken.flow_px.len() / width].map(|part| part as f32);
+        for (pixel, flow_px) in taken.flow_px.iter().enumerate() {
+            let place = [pixel % width, pixel / width].map(|part| part as f32);
+            let [u, v] = [0, 1].map(|axis: usize| (place[axis] - flow_px[axis]).round());
+            if !(0.0..size[0]).contains(&u) || !(0.0..size[1]).contains(&v) {
+                continue;
             }
+            compared += 1;
+            let instance = taken.instance[pixel];
+            of_users += u32::from(instance < 1 << 30);
+            same += u32::from(earlier.instance[v as usize * width + u as usize] == instance);
         }
     }
     let share = f64::from(same) / f64::from(compared);

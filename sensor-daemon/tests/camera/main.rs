@@ -25,6 +25,7 @@ mod lidar_city;
 mod noise;
 mod oracle;
 mod paths;
+mod shutter;
 
 /// An image with all planes.
 #[derive(Debug, Default, Clone, PartialEq)]
@@ -48,6 +49,7 @@ fn params(width: usize, height: usize, mount: [f64; 6]) -> CameraParams {
         range_m: 120.0,
         distortion: [0.0; 5],
         mount,
+        shutter: None,
     }
 }
 
@@ -58,6 +60,17 @@ fn config() -> Config {
 /// Takes an image from the road user in `row`.
 fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut CameraScratch) -> (Taken, CameraPose) {
     take_since(camera, None, states, row, scratch)
+}
+
+/// Takes an image from the road user in `row` during the last of these ticks, with the optical flow since the first of them.
+fn take_rolling(
+    camera: &CameraModel,
+    before: Option<(&[VehicleState], &[SubStep])>,
+    (states, steps): (&[VehicleState], &[SubStep]),
+    row: usize,
+    scratch: &mut CameraScratch,
+) -> Taken {
+    take_in(camera, before, (states, steps), row, None, scratch).0
 }
 
 /// Takes an image from the road user in `row`, with noise.
@@ -84,16 +97,27 @@ fn take_with(
     noise: Option<ImageNoise>,
     scratch: &mut CameraScratch,
 ) -> (Taken, CameraPose) {
+    let before = before.map(|before| (before, &[][..]));
+    take_in(camera, before, (states, &[]), row, noise, scratch)
+}
+
+fn take_in(
+    camera: &CameraModel,
+    before: Option<(&[VehicleState], &[SubStep])>,
+    (states, steps): (&[VehicleState], &[SubStep]),
+    row: usize,
+    noise: Option<ImageNoise>,
+    scratch: &mut CameraScratch,
+) -> (Taken, CameraPose) {
     let mut poses = PastPoses::default();
-    if let Some(before) = before {
+    if let Some((states, steps)) = before {
         let mut targets = Targets::default();
-        targets.update(before, &[], 0);
+        targets.update(states, steps, steps.len() / states.len());
         poses.record(&targets);
     }
     let past = camera.past_pose_on(states[row].vehicle, &poses);
-    let steps: &[SubStep] = &[];
     let mut targets = Targets::default();
-    targets.update(states, steps, 0);
+    targets.update(states, steps, steps.len() / states.len());
     let mut seen = CameraTargets::default();
     seen.update(&targets);
     let [width, height] = camera.size();
@@ -123,6 +147,7 @@ fn take_with(
     let shot = CameraShot {
         noise,
         targets: &seen,
+        tick: Some(&targets),
         carrier: Some(row),
         pose,
         past: past.map(|pose| (pose, &poses)),

@@ -400,6 +400,7 @@ pub const KEYS: &[ConfigKey] = &[
     float("camera.horizontal_fov_deg", "deg", 1.0, 170.0, "Horizontal field of view; pixels are square."),
     float("camera.range_m", "m", 1.0, 2000.0, "Depth at which an image ends: what is farther is sky."),
     floats("camera.distortion", "", 5, -10.0, 10.0, "Lens distortion by Brown's model: k1, k2, p1, p2, k3, as OpenCV orders them; zeros = a pinhole. The field of view is that without distortion."),
+    float("camera.readout_s", "s", 0.0, 100.0, "Rolling shutter: time from the readout of the first row to that of the last one, which is the end of the tick; at most `run.tick_s`. 0 = all rows show the end of the tick (global shutter)."),
     floats("camera.mount", "m, rad", 6, -100.0, 100.0, "Mounting pose: x, y, z from the centre of the rear axle on the ground (m), then roll, pitch (nose up), yaw (rad)."),
     other("camera.depth", ValueKind::Flag, "Images have the distance along the optical axis."),
     other("camera.instance", ValueKind::Flag, "Images have the object that each pixel sees."),

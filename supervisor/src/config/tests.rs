@@ -792,6 +792,40 @@ fn ready_made_suites_are_known_by_name() {
 }
 
 #[test]
+fn a_rolling_shutter_reads_within_a_tick_and_beside_no_events() {
+    let config = config_of(&format!("{TWO_CAMERAS}readout_s = 0.1\n")).unwrap();
+    let units = config.sensor_units(SensorKind::Camera);
+    let readouts_s = [0, 1].map(|place: usize| config.with_unit(&units[place]).camera.readout_s);
+    assert_eq!(readouts_s, [0.0, 0.1]);
+    for (text, message) in [
+        (
+            "camera.vehicles = 1\ncamera.readout_s = 0.2\n".to_owned(),
+            "my.toml:2: `camera` reads its rows within 0.2 s, but a tick, `run.tick_s`, has 0.1 s",
+        ),
+        (
+            "camera.vehicles = 1\ncamera.readout_s = 0.02\ncamera.events = true\n".to_owned(),
+            "my.toml:2: `camera` has a rolling shutter and events",
+        ),
+        (
+            "camera.readout_s = -0.1\n".to_owned(),
+            "my.toml:1: `camera.readout_s` cannot be -0.1",
+        ),
+        (
+            format!("{TWO_CAMERAS}readout_s = 0.3\n"),
+            "camera `right` of the suite `pair` reads its rows within 0.3 s",
+        ),
+        (
+            format!("run.tick_s = 0.05\n{TWO_CAMERAS}readout_s = 0.06\n"),
+            "camera `right` of the suite `pair` reads its rows within 0.06 s, but a tick, `run.tick_s`, has 0.05 s",
+        ),
+    ] {
+        let (error, help) = error_of(&text);
+        assert!(error.contains(message), "{error}");
+        assert!(!help.is_empty(), "{error}");
+    }
+}
+
+#[test]
 fn faults_of_suites_are_named_with_their_lines() {
     let after = |line: &str| error_of(&format!("{TWO_CAMERAS}{line}\n"));
     for (text, message) in [

@@ -257,6 +257,39 @@ fn flow_events_and_temperatures_are_those_of_the_traffic_and_are_made_again() {
 }
 
 #[test]
+fn images_of_a_rolling_shutter_differ_from_those_of_a_global_one_and_are_made_again() {
+    let settings = [
+        "camera.vehicles=3",
+        "camera.semantic=false",
+        "camera.readout_s=0.05",
+        ONE_TICK_AHEAD,
+    ];
+    let workplace = Workplace::new();
+    let recording = workplace.record("first", &arguments(&settings), &[Channel::Image]);
+    let mut boxes = 0;
+    for message in of_channel(&recording, Channel::Image) {
+        let (head, objects, instance) = image(&message);
+        assert!((head.readout_s - 0.05).abs() < 1e-9);
+        for object in objects {
+            let counted = instance.iter().filter(|instance| **instance == object.object).count();
+            assert_eq!(counted, object.visible_px as usize);
+            boxes += 1;
+        }
+    }
+    assert!(boxes > 50, "only {boxes} boxes");
+
+    // The same seed gives the same images with another window too; a global shutter sees the same traffic otherwise.
+    workplace.succeed(&[&arguments(&settings[..3])[..], &["--name", "second"]].concat());
+    workplace.succeed(&[&arguments(&settings[..2])[..], &["--name", "global"]].concat());
+    let [first, second, global] = ["first", "second", "global"].map(|name| workplace.report(name));
+    assert_eq!(first["camera"], second["camera"]);
+    assert_eq!(first["camera"]["messages"], global["camera"]["messages"]);
+    assert_ne!(first["camera"]["hash"], global["camera"]["hash"]);
+    assert_eq!(first["observation_hash"], global["observation_hash"]);
+    workplace.assert_nothing_left();
+}
+
+#[test]
 fn a_lens_that_folds_within_the_image_is_refused() {
     let workplace = Workplace::new();
     let settings = ["camera.vehicles=1", "camera.distortion=[-0.5, 0.0, 0.0, 0.0, 0.0]"];

@@ -6,7 +6,7 @@ use ipc_schema::{config::Config, world::VehicleState};
 use sensor_daemon::sensors::{
     camera::{
         CameraModel, CameraParams, CameraScratch, CameraShot, CameraTargets, EventMemory, ImagePlanes, PastPoses,
-        SKY_INSTANCE, SampledSpan,
+        RollingShutter, SKY_INSTANCE, SampledSpan,
     },
     lidar::{ScanPath, Targets},
 };
@@ -40,6 +40,8 @@ enum Shows {
     Flow,
     /// The events of a tick of ten sub-steps alone.
     Events,
+    /// The labels, by a rolling shutter that reads for 30 ms.
+    Rolling,
 }
 
 /// Sub-steps of a tick.
@@ -50,7 +52,7 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, s
     let [width, height] = camera.size();
     let pixels = width * height;
     let wants = |kinds: &[Shows]| if kinds.contains(&shows) { pixels } else { 0 };
-    let labels = wants(&[Shows::Labels, Shows::Rgb, Shows::Flow]);
+    let labels = wants(&[Shows::Labels, Shows::Rolling, Shows::Rgb, Shows::Flow]);
     let (mut depth_m, mut instance, mut semantic) = (vec![0.0; labels], vec![0; labels], vec![0; labels]);
     let mut rgb = vec![[0; 3]; wants(&[Shows::Rgb])];
     let mut infrared = vec![0; wants(&[Shows::Infrared])];
@@ -71,7 +73,8 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, s
             let mut images = 0;
             for (states, steps) in &ticks {
                 let sub_steps = if shows == Shows::Events { SUB_STEPS } else { 0 };
-                targets.update(states, steps, sub_steps);
+                let known_steps = if shows == Shows::Rolling { SUB_STEPS } else { sub_steps };
+                targets.update(states, steps, known_steps);
                 seen.update(&targets);
                 for sub_step in 0..sub_steps.max(1) {
                     if sub_steps > 0 {
@@ -96,6 +99,7 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, s
                         let shot = CameraShot {
                             noise: None,
                             targets: &seen,
+                            tick: (sub_steps == 0).then_some(&targets),
                             carrier: Some(row),
                             pose: pose.unwrap(),
                             past: past.map(|pose| (pose, &poses)),
@@ -124,7 +128,14 @@ fn rate(camera: &CameraModel, (ground, scene): (Ground, &Scene), shows: Shows, s
 }
 
 impl Shows {
-    const ALL: [Self; 5] = [Self::Labels, Self::Rgb, Self::Flow, Self::Infrared, Self::Events];
+    const ALL: [Self; 6] = [
+        Self::Labels,
+        Self::Rgb,
+        Self::Flow,
+        Self::Infrared,
+        Self::Events,
+        Self::Rolling,
+    ];
 
     fn name(self) -> &'static str {
         match self {
@@ -133,11 +144,12 @@ impl Shows {
             Self::Flow => "the first three and optical flow",
             Self::Infrared => "infrared alone",
             Self::Events => "events alone, ten sub-steps",
+            Self::Rolling => "the first three, rolling shutter",
         }
     }
 }
 
-fn camera([width, height]: [usize; 2], scene: &Scene) -> CameraModel {
+fn camera([width, height]: [usize; 2], scene: &Scene, shutter: Option<RollingShutter>) -> CameraModel {
     let params = CameraParams {
         width,
         height,
@@ -145,6 +157,7 @@ fn camera([width, height]: [usize; 2], scene: &Scene) -> CameraModel {
         range_m: RANGE_M,
         distortion: [0.0; 5],
         mount: [1.5, 0.0, 1.4, 0.0, 0.0, 0.0],
+        shutter,
     };
     CameraModel::new(&params, &config(), scene)
 }
@@ -168,8 +181,12 @@ pub fn measure(python: Option<&Path>, bench: &BenchSize) -> serde_json::Value {
         let scene = ground.scene();
         for size in SIZES {
             for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
-                let camera = camera(size, &scene).with_path(path);
                 for shows in Shows::ALL {
+                    let shutter = (shows == Shows::Rolling).then_some(RollingShutter {
+                        readout_s: 0.03,
+                        tick_s: lidar_city::TICK_S,
+                    });
+                    let camera = camera(size, &scene, shutter).with_path(path);
                     let rate = rate(&camera, (ground, &scene), shows, bench);
                     println!(
                         "{} {size:?} {} {}: {rate:.0} images/s",
@@ -254,7 +271,7 @@ struct ImageRound {
 
 impl StillScene {
     fn new(size: [usize; 2], scene: &Scene) -> Self {
-        let camera = camera(size, scene);
+        let camera = camera(size, scene, None);
         let (mut states, _) = Ground::Upright.traffic(scene, CAMERAS, 0);
         // Vehicles of random traffic overlap, and Open3D sees walls from inside: none is about a camera.
         let carriers: Vec<[f64; 2]> = states[..CAMERAS].iter().map(|state| [state.x_m, state.y_m]).collect();
@@ -300,6 +317,7 @@ impl StillScene {
                 let shot = CameraShot {
                     noise: None,
                     targets: &self.seen,
+                    tick: None,
                     carrier: Some(row),
                     pose: self.camera.pose_on(&self.targets, row).unwrap(),
                     past: None,

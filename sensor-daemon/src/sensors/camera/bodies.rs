@@ -19,7 +19,7 @@ use crate::sensors::lidar::{
     Targets,
     sensor::SensorPose,
     solids::{INTEREST, StillSolid, StillSolids},
-    targets::{MovingTarget, Pose},
+    targets::{MovingTarget, Pose, TickMoment},
 };
 
 /// Most boxes of a road user.
@@ -44,15 +44,15 @@ struct BodyBox {
     z_m: [f64; 2],
 }
 
-/// A road user at the end of a tick.
+/// A road user at one time.
 #[derive(Debug, Clone, Copy)]
-struct RoadUserBody {
+pub(super) struct RoadUserBody {
     boxes: [BodyBox; MOST_BOXES],
     box_count: usize,
     /// It is a cylinder, which `bounds` describes.
     is_round: bool,
     bounds: BodyBounds,
-    body: SeenBody,
+    pub(super) body: SeenBody,
     pose: Pose,
 }
 
@@ -86,17 +86,27 @@ impl CameraTargets {
             .extend(road_users.map(|(row, mover)| RoadUserBody::new(mover, targets.pose(row, sub_step, 1.0, 0.0))));
     }
 
-    /// The motion of a road user in the image since an earlier time; `None` if it was not there.
+    /// The motion of a road user in the image since a moment of an earlier tick; `None` if it was not there.
     pub(super) fn motion(
         &self,
         row: usize,
         now: &SensorPose,
         past: &SensorPose,
-        poses: &PastPoses,
+        (poses, moment): (&PastPoses, Option<&TickMoment>),
     ) -> Option<PixelMotion> {
         let user = &self.users[row];
-        let before = poses.of(user.body.instance)?;
-        Some(PixelMotion::of_body(now, past, &user.pose, before, user.is_round))
+        let before = poses.of(user.body.instance, moment)?;
+        Some(PixelMotion::of_body(now, past, &user.pose, &before, user.is_round))
+    }
+
+    /// Removes all road users.
+    pub(super) fn clear(&mut self) {
+        self.users.clear();
+    }
+
+    /// Adds a road user.
+    pub(super) fn add(&mut self, user: RoadUserBody) {
+        self.users.push(user);
     }
 
     /// Number of road users.
@@ -113,7 +123,7 @@ impl CameraTargets {
 }
 
 impl RoadUserBody {
-    fn new(mover: &MovingTarget, pose: Pose) -> Self {
+    pub(super) fn new(mover: &MovingTarget, pose: Pose) -> Self {
         let (sin, cos) = libm::sincos(pose.attitude_rad[2]);
         let [x, y, z] = pose.position_m;
         let middle_m = 0.5 * (mover.rear_m + mover.front_m);
@@ -168,6 +178,29 @@ impl RoadUserBody {
             pose,
         }
     }
+
+    /// Corners of its parts in the camera's frame, for the box about all of it.
+    pub(super) fn corners(&self, view: &CameraView<'_>, mut found: impl FnMut([f64; 3])) {
+        if self.is_round {
+            let BodyBounds {
+                centre_m: [x, y],
+                radius_m: r,
+                z_m,
+            } = self.bounds;
+            // The box about a cylinder: eight corners of an octagon about it.
+            for turn in 0..16_u32 {
+                let (sin, cos) = libm::sincos(std::f64::consts::TAU * f64::from(turn) / 16.0);
+                view.upright([x + r * cos, y + r * sin], z_m)
+                    .into_iter()
+                    .for_each(&mut found);
+            }
+        }
+        for part in self.boxes[..self.box_count].iter().filter(|_| !self.is_round) {
+            for corner in part.corners_m {
+                view.upright(corner, part.z_m).into_iter().for_each(&mut found);
+            }
+        }
+    }
 }
 
 impl StillBodies {
@@ -183,20 +216,34 @@ impl StillBodies {
         Self { solids, roofs, pieces }
     }
 
-    /// Adds the bodies that a camera may see.
+    /// Replaces `near` by the bodies that may be within `reach_m` of a place.
+    pub(super) fn near(&self, place_m: Point, reach_m: f64, near: &mut Vec<u32>) {
+        near.clear();
+        self.solids
+            .within(place_m, reach_m, |number, _| near.push(number as u32));
+    }
+
+    /// The cylinder about a body.
     #[inline(always)]
-    pub(super) fn gather(&self, view: &CameraView<'_>, list: &mut DrawList, surfaces: &mut SurfaceTable) {
+    pub(super) fn bounds(&self, number: u32) -> BodyBounds {
+        let still = &self.solids.stills[number as usize];
+        BodyBounds {
+            centre_m: still.centre_m,
+            radius_m: still.reach_m,
+            z_m: still.z_m,
+        }
+    }
+
+    /// Adds those of these bodies that a camera may see.
+    #[inline(always)]
+    pub(super) fn gather(&self, view: &CameraView<'_>, near: &[u32], list: &mut DrawList, surfaces: &mut SurfaceTable) {
         let [x, y, z] = view.pose.position_m;
-        self.solids.within([x, y], view.optics.reach_m, |number, _| {
-            let still = &self.solids.stills[number];
-            let bounds = BodyBounds {
-                centre_m: still.centre_m,
-                radius_m: still.reach_m,
-                z_m: still.z_m,
-            };
-            if !view.may_see(&bounds) {
-                return;
+        for number in near {
+            if !view.may_see(&self.bounds(*number)) {
+                continue;
             }
+            let number = *number as usize;
+            let still = &self.solids.stills[number];
             let body = surfaces.body(SeenBody {
                 instance: still.object,
                 label: SemanticLabel::of_tag(still.word) as u8,
@@ -215,7 +262,7 @@ impl StillBodies {
             }
             let (above, below) = (z > still.z_m[1], z < still.z_m[0]);
             if !above && !below {
-                return;
+                continue;
             }
             let surface = surfaces.surface(body, [0.0, 0.0, if above { 1.0 } else { -1.0 }]);
             for piece in &self.pieces[self.roofs[number].start as usize..self.roofs[number].end as usize] {
@@ -229,7 +276,7 @@ impl StillBodies {
                     surface,
                 );
             }
-        });
+        }
     }
 }
 
@@ -295,34 +342,9 @@ impl CameraTargets {
         }
     }
 
-    /// Instance and class of a road user.
-    pub(super) fn body(&self, row: usize) -> (u32, u8) {
-        let body = &self.users[row].body;
-        (body.instance, body.label)
-    }
-
-    /// Corners of a road user's parts in the camera's frame, for the box about all of it.
-    pub(super) fn corners(&self, view: &CameraView<'_>, row: usize, mut found: impl FnMut([f64; 3])) {
-        let user = &self.users[row];
-        if user.is_round {
-            let BodyBounds {
-                centre_m: [x, y],
-                radius_m: r,
-                z_m,
-            } = user.bounds;
-            // The box about a cylinder: eight corners of an octagon about it.
-            for turn in 0..16_u32 {
-                let (sin, cos) = libm::sincos(std::f64::consts::TAU * f64::from(turn) / 16.0);
-                view.upright([x + r * cos, y + r * sin], z_m)
-                    .into_iter()
-                    .for_each(&mut found);
-            }
-        }
-        for part in user.boxes[..user.box_count].iter().filter(|_| !user.is_round) {
-            for corner in part.corners_m {
-                view.upright(corner, part.z_m).into_iter().for_each(&mut found);
-            }
-        }
+    /// A road user.
+    pub(super) fn user(&self, row: usize) -> &RoadUserBody {
+        &self.users[row]
     }
 }
 

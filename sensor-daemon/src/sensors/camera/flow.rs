@@ -8,30 +8,35 @@ use super::optics::CameraOptics;
 use crate::sensors::lidar::{
     Targets,
     sensor::{Rotation, SensorPose, turned},
-    targets::Pose,
+    targets::{Pose, TickMoment},
 };
 
 /// Where road users were at an earlier time.
 #[derive(Debug, Clone, Default)]
 pub struct PastPoses {
-    /// Dense index and pose, in the order of the indices.
-    poses: Vec<(u32, Pose)>,
+    /// Dense index and row, in the order of the indices.
+    rows: Vec<(u32, u32)>,
+    targets: Targets,
 }
 
 impl PastPoses {
-    /// Replaces the poses by those at the end of the tick of `targets`.
+    /// Replaces the poses by those of the tick of `targets`.
     pub fn record(&mut self, targets: &Targets) {
-        self.poses.clear();
-        let road_users = &targets.movers[..targets.road_users];
-        self.poses
-            .extend(road_users.iter().map(|mover| (mover.object, mover.end)));
-        self.poses.sort_unstable_by_key(|(vehicle, _)| *vehicle);
+        self.targets.copy_from(targets);
+        self.rows.clear();
+        let road_users = (0..).zip(&targets.movers[..targets.road_users]);
+        self.rows.extend(road_users.map(|(row, mover)| (mover.object, row)));
+        self.rows.sort_unstable();
     }
 
-    /// Pose of a road user.
-    pub(in crate::sensors) fn of(&self, vehicle: u32) -> Option<&Pose> {
-        let place = self.poses.binary_search_by_key(&vehicle, |(known, _)| *known).ok()?;
-        Some(&self.poses[place].1)
+    /// Pose of a road user at a moment of the tick, `None` being its end.
+    pub(in crate::sensors) fn of(&self, vehicle: u32, moment: Option<&TickMoment>) -> Option<Pose> {
+        let place = self.rows.binary_search_by_key(&vehicle, |(known, _)| *known).ok()?;
+        let row = self.rows[place].1 as usize;
+        Some(match moment {
+            None => self.targets.movers[row].end,
+            Some(moment) => self.targets.pose_at(row, moment),
+        })
     }
 }
 

@@ -21,6 +21,7 @@ mod optics;
 mod raster;
 mod relief;
 mod resolve;
+mod shutter;
 mod surfaces;
 mod thermal;
 mod view;
@@ -31,13 +32,14 @@ pub use flow::PastPoses;
 pub use ipc_schema::image::{SKY_INSTANCE, SeenObject};
 pub use labels::SemanticLabel;
 pub use noise::{ImageNoise, PixelNoise};
-pub use optics::CameraParams;
+pub use optics::{CameraParams, RollingShutter};
 pub use resolve::ImagePlanes;
 
 use crate::sensors::lidar::{
     ScanPath, Targets, flat_ground_m,
     sensor::{SensorPose, turned},
     simd::{self, Simd},
+    targets::TickMoment,
 };
 
 /// A camera and the scene around it; one model serves all vehicles that carry it.
@@ -86,21 +88,44 @@ impl SightScene {
 /// Working memory of one thread: empty at first, then kept.
 #[derive(Debug, Default)]
 pub struct CameraScratch {
+    /// Bodies of the map that may be in the image.
+    near: Vec<u32>,
+    band: BandScratch,
+    rolled: shutter::RolledImage,
+    corners: boxes::RolledCorners,
+}
+
+/// Working memory of the rows that are taken at one time.
+#[derive(Debug, Default)]
+struct BandScratch {
     canvas: raster::Canvas,
     list: view::DrawList,
     surfaces: surfaces::SurfaceTable,
+    /// Pixels of each road user of the surface table.
     counts: Vec<resolve::PixelCount>,
     motions: resolve::ImageMotions,
+}
+
+/// What the rows of one time are taken of.
+struct BandShot<'a> {
+    view: view::CameraView<'a>,
+    targets: &'a CameraTargets,
+    carrier: Option<usize>,
+    /// The camera at the earlier time of the optical flow, and that time: the end of its tick, or a moment of it.
+    past: Option<(SensorPose, &'a PastPoses, Option<TickMoment>)>,
+    noise: Option<ImageNoise>,
 }
 
 /// What an image is taken of.
 #[derive(Debug, Clone, Copy)]
 pub struct CameraShot<'a> {
-    /// The road users.
+    /// The road users at the end of the tick.
     pub targets: &'a CameraTargets,
+    /// Their tick, in which a camera with a rolling shutter reads its rows. Without it every camera has a global one.
+    pub tick: Option<&'a Targets>,
     /// Row of the road user that carries the camera and is invisible to it.
     pub carrier: Option<usize>,
-    /// The camera.
+    /// The camera at the end of the tick.
     pub pose: CameraPose,
     /// Camera and road users at the time since which the optical flow counts; without it there is no flow.
     pub past: Option<(CameraPose, &'a PastPoses)>,
@@ -195,7 +220,8 @@ impl CameraModel {
     /// The camera on a road user at an earlier time; `None` if it was not there.
     #[must_use]
     pub fn past_pose_on(&self, vehicle: u32, poses: &PastPoses) -> Option<CameraPose> {
-        poses.of(vehicle).map(|pose| CameraPose(self.optics.mount.sensor(pose)))
+        let pose = poses.of(vehicle, None)?;
+        Some(CameraPose(self.optics.mount.sensor(&pose)))
     }
 
     /// Takes an image: fills the planes that are wanted, and `objects` with the road users in the image, in the order of their rows. A
@@ -254,50 +280,109 @@ impl CameraModel {
         planes: &mut ImagePlanes<'_>,
         objects: &mut Vec<SeenObject>,
     ) {
-        let sight = &*self.sight;
-        let view = view::CameraView {
-            optics: &self.optics,
-            pose: shot.pose.0,
-        };
         let CameraScratch {
+            near,
+            band: band_scratch,
+            rolled,
+            corners,
+        } = scratch;
+        let (sight, optics) = (&*self.sight, &self.optics);
+        band_scratch.canvas.room_for(optics);
+        // Find what may be in the image.
+        let rolling = self.rolling(shot);
+        let bands = match &rolling {
+            Some(rolling) => {
+                rolled.begin(optics, rolling, &sight.bodies, near);
+                &optics.bands[..]
+            }
+            None => {
+                let [x, y, _] = shot.pose.0.position_m;
+                sight.bodies.near([x, y], optics.reach_m, near);
+                std::slice::from_ref(&optics.whole)
+            }
+        };
+        // Take one band after the other; a global shutter has one.
+        objects.clear();
+        for (number, band) in bands.iter().enumerate() {
+            let band_shot = match &rolling {
+                Some(rolling) => rolled.band_shot((optics, number), rolling, shot),
+                None => BandShot {
+                    view: view::CameraView {
+                        optics,
+                        band,
+                        pose: shot.pose.0,
+                    },
+                    targets: shot.targets,
+                    carrier: shot.carrier,
+                    past: shot.past.map(|(pose, poses)| (pose.0, poses, None)),
+                    noise: shot.noise,
+                },
+            };
+            self.take_band::<S>(&band_shot, near, band_scratch, planes);
+            let (rows, counts) = (&band_scratch.surfaces.users, &band_scratch.counts);
+            if rolling.is_some() {
+                rolled.end_band(rows, counts);
+                continue;
+            }
+            for (row, count) in rows.iter().zip(counts).filter(|(_, count)| count.pixels > 0) {
+                let user = shot.targets.user(*row as usize);
+                objects.push(boxes::seen_object(&band_shot.view, user, count));
+            }
+        }
+        if let Some(rolling) = &rolling {
+            let seen = rolled.users.iter().filter(|user| user.count.pixels > 0);
+            objects.extend(seen.map(|user| boxes::rolled_object(optics, rolled, user, rolling.targets, corners)));
+        }
+    }
+
+    /// Fills the rows of a view, and counts the pixels of each road user in them.
+    #[inline(always)]
+    fn take_band<S: Simd>(
+        &self,
+        shot: &BandShot<'_>,
+        near: &[u32],
+        scratch: &mut BandScratch,
+        planes: &mut ImagePlanes<'_>,
+    ) {
+        let BandScratch {
             canvas,
             list,
             surfaces,
             counts,
             motions,
         } = scratch;
-        let (targets, carrier) = (shot.targets, shot.carrier);
-        // Gather what may be in the image, and sort it.
+        let (sight, BandShot { view, targets, .. }) = (&*self.sight, shot);
+        // Gather what may be in the rows, and sort it.
         list.clear();
         surfaces.begin(planes.have_colours().then_some(sight.light));
-        sight.bodies.gather(&view, list, surfaces);
-        targets.gather(&view, carrier, list, surfaces);
+        sight.bodies.gather(view, near, list, surfaces);
+        targets.gather(view, shot.carrier, list, surfaces);
         list.sort();
         // Find the first surface of each pixel.
-        canvas.room_for(&self.optics);
         canvas.fill::<S>(
+            &view.band.tiles,
             sight.ground_m.and_then(|ground_m| view.ground(ground_m)),
-            (1.0 / self.optics.range_m) as f32,
+            (1.0 / view.optics.range_m) as f32,
         );
         canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
         if let Some(relief) = &sight.relief {
-            relief.draw::<S>(&view, canvas, list);
+            relief.draw::<S>(view, canvas, list);
         }
         // Write what that surface shows.
         motions.still = None;
         motions.users.clear();
-        if let (false, Some((past, poses))) = (planes.flow_px.is_empty(), &shot.past) {
-            motions.still = Some(flow::PixelMotion::of_still(&view.pose, &past.0));
+        if let (false, Some((past, poses, moment))) = (planes.flow_px.is_empty(), &shot.past) {
+            motions.still = Some(flow::PixelMotion::of_still(&view.pose, past));
             let rows = surfaces.users.iter().map(|row| *row as usize);
             motions
                 .users
-                .extend(rows.map(|row| targets.motion(row, &view.pose, &past.0, poses)));
+                .extend(rows.map(|row| targets.motion(row, &view.pose, past, (poses, moment.as_ref()))));
         }
         counts.clear();
         counts.resize(surfaces.users.len(), resolve::PixelCount::NONE);
         let resolver = resolve::Resolver {
             canvas,
-            view,
+            view: *view,
             surfaces,
             ground: &sight.ground,
             light: &sight.light,
@@ -307,17 +392,12 @@ impl CameraModel {
             noise: shot.noise,
         };
         resolver.write::<S>(planes, counts);
-        objects.clear();
-        for (row, count) in surfaces.users.iter().zip(counts.iter()) {
-            if count.pixels > 0 {
-                objects.push(boxes::seen_object(
-                    &view,
-                    targets,
-                    *row as usize,
-                    targets.body(*row as usize),
-                    count,
-                ));
-            }
-        }
+    }
+
+    /// The tick during which the rows of an image are read; `None` of a global shutter.
+    fn rolling<'a>(&'a self, shot: &CameraShot<'a>) -> Option<shutter::RollingTick<'a>> {
+        let (targets, row) = (shot.tick?, shot.carrier?);
+        let shutter = self.optics.shutter.as_ref()?;
+        (row < targets.movers.len()).then_some(shutter::RollingTick { shutter, targets, row })
     }
 }

@@ -1,6 +1,6 @@
 //! The image of a camera: its size, its field of view, its lens, its mounting.
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use ipc_schema::config::{CameraConfig, LensDistortion};
 
@@ -22,10 +22,23 @@ pub struct CameraParams {
     pub distortion: [f64; 5],
     /// Where it is mounted: x, y, z from the centre of the rear axle on the ground (metres), then roll, pitch (nose up), yaw (radians).
     pub mount: [f64; 6],
+    /// `None`: all rows show the end of the tick (global shutter).
+    pub shutter: Option<RollingShutter>,
 }
 
-impl From<&CameraConfig> for CameraParams {
-    fn from(camera: &CameraConfig) -> Self {
+/// A shutter that reads the rows of an image one after the other, the last of them at the end of the tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RollingShutter {
+    /// From the readout of the first row to that of the last one, seconds; at most a tick.
+    pub readout_s: f64,
+    /// Length of a tick, seconds.
+    pub tick_s: f64,
+}
+
+impl CameraParams {
+    /// As configured, in a run whose ticks take `tick_s`.
+    #[must_use]
+    pub fn new(camera: &CameraConfig, tick_s: f64) -> Self {
         Self {
             width: camera.width as usize,
             height: camera.height as usize,
@@ -33,6 +46,41 @@ impl From<&CameraConfig> for CameraParams {
             range_m: camera.range_m,
             distortion: camera.distortion,
             mount: camera.mount,
+            shutter: (camera.readout_s > 0.0).then_some(RollingShutter {
+                readout_s: camera.readout_s,
+                tick_s,
+            }),
+        }
+    }
+}
+
+/// Rows of an image that show the world at one time.
+#[derive(Debug, Clone)]
+pub(super) struct ImageBand {
+    /// Its rows of tiles and of pixels.
+    pub(super) tiles: Range<usize>,
+    pub(super) rows: Range<usize>,
+    /// How long before the end of the tick it is read, seconds.
+    pub(super) before_end_s: f64,
+    /// Planes through the pinhole, their normals of length 1 into the band: ahead, right, left, top, bottom.
+    pub(super) frustum: [[f64; 3]; 5],
+}
+
+impl ImageBand {
+    /// Of these rows of tiles. The slopes of its rays are at most `a` to both sides, and those upwards lie between `low` and `high`.
+    fn new(tiles: Range<usize>, height: usize, a: f64, [low, high]: [f64; 2]) -> Self {
+        let [by_a, by_low, by_high] = [a, low, high].map(|slope| 1.0 / (1.0 + slope * slope).sqrt());
+        Self {
+            rows: tiles.start * TILE_ROWS..(tiles.end * TILE_ROWS).min(height),
+            tiles,
+            before_end_s: 0.0,
+            frustum: [
+                [1.0, 0.0, 0.0],
+                [a * by_a, by_a, 0.0],
+                [a * by_a, -by_a, 0.0],
+                [high * by_high, 0.0, -by_high],
+                [-low * by_low, 0.0, by_low],
+            ],
         }
     }
 }
@@ -101,8 +149,11 @@ pub(super) struct CameraOptics {
     pub(super) mount: SensorMount,
     /// The lens; `None` of a pinhole.
     pub(super) lens: Option<CameraLens>,
-    /// Planes through the pinhole, their normals of length 1 into the image: ahead, right, left, top, bottom.
-    pub(super) frustum: [[f64; 3]; 5],
+    /// All rows.
+    pub(super) whole: ImageBand,
+    pub(super) shutter: Option<RollingShutter>,
+    /// The rows of tiles of a rolling shutter, from the top; empty without one.
+    pub(super) bands: Vec<ImageBand>,
 }
 
 impl CameraOptics {
@@ -117,7 +168,24 @@ impl CameraOptics {
             None => centre_px.map(|half| half / focal_px),
             Some(lens) => lens.rays.most().map(f64::from),
         };
-        let [by_a, by_b] = [a, b].map(|slope| 1.0 / (1.0 + slope * slope).sqrt());
+        let tile_rows = height.div_ceil(TILE_ROWS);
+        let bands = (0..tile_rows).filter_map(|tile| {
+            let shutter = params.shutter.as_ref()?;
+            let rows = [tile * TILE_ROWS, ((tile + 1) * TILE_ROWS).min(height)];
+            let slopes = match &lens {
+                None => rows.map(|row| (centre_px[1] - row as f64) / focal_px),
+                Some(lens) => {
+                    let [low, high] = lens.rays.row_bounds[tile].map(f64::from);
+                    [high, low]
+                }
+            };
+            let mut band = ImageBand::new(tile..tile + 1, height, a, [slopes[1], slopes[0]]);
+            let middle = 0.5 * (rows[0] + rows[1] - 1) as f64;
+            let last = (height - 1) as f64;
+            band.before_end_s = shutter.readout_s * (last - middle) / last.max(1.0);
+            Some(band)
+        });
+        let bands = bands.collect();
         Self {
             width,
             height,
@@ -127,13 +195,9 @@ impl CameraOptics {
             reach_m: params.range_m * (1.0 + a * a + b * b).sqrt(),
             mount: SensorMount::new(params.mount),
             lens,
-            frustum: [
-                [1.0, 0.0, 0.0],
-                [a * by_a, by_a, 0.0],
-                [a * by_a, -by_a, 0.0],
-                [b * by_b, 0.0, -by_b],
-                [b * by_b, 0.0, by_b],
-            ],
+            whole: ImageBand::new(0..tile_rows, height, a, [-b, b]),
+            shutter: params.shutter,
+            bands,
         }
     }
 }

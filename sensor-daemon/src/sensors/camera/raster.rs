@@ -9,7 +9,7 @@
 //! The image is a grid of tiles of sixteen columns and eight rows. Surfaces come nearest first, and a tile remembers its farthest pixel:
 //! most hidden surfaces are refused tile by tile (N. Greene, M. Kass and G. Miller, *Hierarchical Z-Buffer Visibility*, SIGGRAPH 1993).
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use crate::sensors::lidar::simd::{Floats, Simd, WIDTH, Words};
 
@@ -94,7 +94,7 @@ pub(super) struct BentRays {
     bounds: Vec<[[f32; 2]; 2]>,
     /// Those of each column of tiles and of each row of tiles.
     column_bounds: Vec<[f32; 2]>,
-    row_bounds: Vec<[f32; 2]>,
+    pub(super) row_bounds: Vec<[f32; 2]>,
 }
 
 impl BentRays {
@@ -245,15 +245,16 @@ impl Canvas {
         }
     }
 
-    /// Fills the image with flat ground, of inverse depth `ground`, and with sky, `far` being the inverse depth of the end of the range.
+    /// Fills these rows of tiles with flat ground, of inverse depth `ground`, and with sky, `far` being the inverse depth of the end of
+    /// the range.
     #[inline(always)]
-    pub(super) fn fill<S: Simd>(&mut self, ground: Option<LinearForm>, far: f32) {
-        let [tiles_x, tiles_y] = self.tiles;
-        self.least[..tiles_x * tiles_y].fill(far);
+    pub(super) fn fill<S: Simd>(&mut self, tile_rows: &Range<usize>, ground: Option<LinearForm>, far: f32) {
+        let tiles_x = self.tiles[0];
+        self.least[tile_rows.start * tiles_x..tile_rows.end * tiles_x].fill(far);
         let sky = S::splat(far);
         let LinearForm(plane) = ground.unwrap_or(LinearForm([0.0; 3]));
         let [ground_word, sky_word] = [GROUND_SURFACE, SKY_SURFACE].map(|word| S::floats(S::splat_words(word)));
-        for row in 0..self.b.len() {
+        for row in tile_rows.start * TILE_ROWS..tile_rows.end * TILE_ROWS {
             let by_row = S::splat(self.b[row]) * S::splat(plane[2]);
             for tile in 0..tiles_x {
                 let inverse = match self.bent {
@@ -273,7 +274,7 @@ impl Canvas {
         if ground.is_none() {
             return;
         }
-        for tile_y in 0..tiles_y {
+        for tile_y in tile_rows.clone() {
             for tile_x in 0..tiles_x {
                 let [a, b] = self.bounds([tile_x, tile_y]);
                 let [low, _] = LinearForm(plane).bounds(a, b);

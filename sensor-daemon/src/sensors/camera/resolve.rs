@@ -55,6 +55,13 @@ impl PixelCount {
         box_px: [u16::MAX, u16::MAX, 0, 0],
     };
 
+    /// Adds the pixels of another part of the image.
+    pub(super) fn add_all(&mut self, other: &Self) {
+        self.pixels += other.pixels;
+        let ([left, top, right, bottom], [l, t, r, b]) = (self.box_px, other.box_px);
+        self.box_px = [left.min(l), top.min(t), right.max(r), bottom.max(b)];
+    }
+
     /// Adds a run of pixels in a row.
     fn add(&mut self, first: usize, end: usize, row: usize) {
         self.pixels += (end - first) as u32;
@@ -120,12 +127,12 @@ struct Pixels {
 }
 
 impl Resolver<'_> {
-    /// Writes the planes and counts the pixels of each road user into `counts`, one for each of the table's.
+    /// Writes the rows of the view into the planes and counts the pixels of each road user into `counts`, one for each of the table's.
     #[inline(always)]
     pub(super) fn write<S: Simd>(&self, planes: &mut ImagePlanes<'_>, counts: &mut [PixelCount]) {
         let optics = self.view.optics;
         let axes = self.view.axes();
-        for row in 0..optics.height {
+        for row in self.view.band.rows.clone() {
             let mut run = UserRun {
                 user: NO_USER,
                 first: 0,

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::{
-    optics::CameraOptics,
+    optics::{CameraOptics, ImageBand},
     raster::{Canvas, Cylinder, DrawItem, DrawShape, LinearForm, TILE_ROWS, TileRange},
 };
 use crate::sensors::lidar::{sensor::SensorPose, simd::WIDTH};
@@ -11,10 +11,11 @@ use crate::sensors::lidar::{sensor::SensorPose, simd::WIDTH};
 /// Corners at least so far ahead are projected; a surface with a nearer one may be anywhere in the image, metres.
 const NEAREST_M: f64 = 1e-3;
 
-/// A camera at one time.
+/// A camera at one time, and the rows of its image that it takes then.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CameraView<'a> {
     pub(super) optics: &'a CameraOptics,
+    pub(super) band: &'a ImageBand,
     pub(super) pose: SensorPose,
 }
 
@@ -78,14 +79,14 @@ impl CameraView<'_> {
         (height_m > 0.0).then(|| LinearForm(up.map(|part| (-part / height_m) as f32)))
     }
 
-    /// True if a body may be in the image.
+    /// True if a body may be in the rows of this view.
     #[inline(always)]
     pub(super) fn may_see(&self, body: &BodyBounds) -> bool {
         let middle_m = 0.5 * (body.z_m[0] + body.z_m[1]);
         let half_m = 0.5 * (body.z_m[1] - body.z_m[0]);
         let [x, y, z] = self.seen([body.centre_m[0], body.centre_m[1], middle_m]);
         let up = &self.pose.world_from_sensor[2];
-        self.optics.frustum.iter().all(|[nx, ny, nz]| {
+        self.band.frustum.iter().all(|[nx, ny, nz]| {
             let rise = nx * up[0] + ny * up[1] + nz * up[2];
             let reach_m = half_m * rise.abs() + body.radius_m * (1.0 - rise * rise).max(0.0).sqrt();
             nx * x + ny * y + nz * z > -reach_m
@@ -109,11 +110,15 @@ impl CameraView<'_> {
         } else {
             f32::INFINITY
         };
-        let whole = [[0.0, optics.width as f64 - 1.0], [0.0, optics.height as f64 - 1.0]];
+        let rows = &self.band.rows;
+        let whole = [
+            [0.0, optics.width as f64 - 1.0],
+            [rows.start as f64, rows.end as f64 - 1.0],
+        ];
         let mut pixels = whole;
         if near <= NEAREST_M {
             if let Some(lens) = &optics.lens {
-                return Some((lens.rays.whole(), most));
+                return Some((self.within_band(lens.rays.whole())?, most));
             }
         } else {
             let (mut a, mut b) = ([f64::INFINITY, f64::NEG_INFINITY], [f64::INFINITY, f64::NEG_INFINITY]);
@@ -123,7 +128,7 @@ impl CameraView<'_> {
                 (a, b) = ([a[0].min(y), a[1].max(y)], [b[0].min(z), b[1].max(z)]);
             }
             if let Some(lens) = &optics.lens {
-                return Some((lens.rays.tiles(a, b)?, most));
+                return Some((self.within_band(lens.rays.tiles(a, b)?)?, most));
             }
             let focal = optics.focal_px;
             let pixel =
@@ -142,6 +147,13 @@ impl CameraView<'_> {
             y: tiles(pixels[1], TILE_ROWS),
         };
         Some((range, most))
+    }
+
+    /// The part of these tiles that lies in the rows of this view; `None` if there is none.
+    fn within_band(&self, mut range: TileRange) -> Option<TileRange> {
+        let rows = &self.band.tiles;
+        range.y = [range.y[0].max(rows.start as u16), range.y[1].min(rows.end as u16 - 1)];
+        (range.y[0] <= range.y[1]).then_some(range)
     }
 
     /// Adds a convex polygon, its corners counter-clockwise as seen from outside. `normal` points outwards; both in the camera's frame.

@@ -22,6 +22,16 @@ pub(in crate::sensors) struct Pose {
 /// Pose at the end of a sub-step: x, y, z and heading relative to the end of the tick, then absolute roll and pitch.
 type Knot = [f32; 6];
 
+/// A time within a tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::sensors) struct TickMoment {
+    sub_step: usize,
+    /// Share of the sub-step, 0 … 1.
+    at: f64,
+    /// Length of a sub-step, seconds.
+    dt_s: f64,
+}
+
 /// A road user.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::sensors) struct MovingTarget {
@@ -103,6 +113,58 @@ impl Targets {
     pub fn add_fixed(&mut self, states: &[VehicleState]) {
         self.movers
             .extend(states.iter().map(|state| MovingTarget::new(state, &[])));
+    }
+
+    /// Replaces the targets by `other`, in the memory that there is.
+    pub(in crate::sensors) fn copy_from(&mut self, other: &Self) {
+        let Self {
+            movers,
+            road_users,
+            knots,
+            sub_steps,
+            tick_s,
+            near,
+        } = other;
+        self.movers.clone_from(movers);
+        self.knots.clone_from(knots);
+        self.near.clone_from(near);
+        (self.road_users, self.sub_steps, self.tick_s) = (*road_users, *sub_steps, *tick_s);
+    }
+
+    /// The moment `before_end_s` before the end of the tick, which takes `tick_s`.
+    pub(in crate::sensors) fn moment(&self, before_end_s: f64, tick_s: f64) -> TickMoment {
+        let count = self.sub_steps.max(1);
+        let dt_s = tick_s / count as f64;
+        let since_begin = ((tick_s - before_end_s) / dt_s).max(0.0);
+        let sub_step = (since_begin as usize).min(count - 1);
+        TickMoment {
+            sub_step,
+            at: (since_begin - sub_step as f64).min(1.0),
+            dt_s,
+        }
+    }
+
+    /// Pose of a road user at a moment of the tick.
+    #[inline(always)]
+    pub(in crate::sensors) fn pose_at(&self, row: usize, moment: &TickMoment) -> Pose {
+        self.pose(row, moment.sub_step, moment.at, moment.dt_s)
+    }
+
+    /// Upper bound of the distance of a road user's origin from its place at the end of the tick, which takes `tick_s`, metres.
+    pub(in crate::sensors) fn most_shift_m(&self, row: usize, tick_s: f64) -> f64 {
+        let mover = &self.movers[row];
+        if mover.is_still {
+            return 0.0;
+        }
+        let dt_s = tick_s / self.sub_steps.max(1) as f64;
+        let knots = &self.knots[row * self.sub_steps..(row + 1) * self.sub_steps];
+        let begin: [f64; 3] = std::array::from_fn(|i| f64::from(knots[0][i]) - f64::from(mover.rates[i]) * dt_s);
+        let places = knots.iter().map(|knot| [0, 1, 2].map(|i: usize| f64::from(knot[i])));
+        // Between two of these places it moves straight.
+        let square = std::iter::once(begin)
+            .chain(places)
+            .map(|[x, y, z]| x * x + y * y + z * z);
+        square.fold(0.0, f64::max).sqrt()
     }
 
     /// Pose of a road user at share `at` (0 … 1) of a sub-step that takes `dt_s`.

@@ -231,6 +231,7 @@ impl RadarModel {
         let shot = CameraShot {
             noise: None,
             targets: seen,
+            tick: None,
             carrier: Some(row),
             pose: *pose,
             past: None,
@@ -382,6 +383,7 @@ fn rays(radar: &RadarConfig) -> CameraParams {
         range_m: radar.range_m,
         distortion: [0.0; 5],
         mount: radar.mount,
+        shutter: None,
     }
 }
 

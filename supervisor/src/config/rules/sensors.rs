@@ -14,6 +14,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         .or_else(|| lidar(config))
         .or_else(|| observed_plane(config))
         .or_else(|| brightness_events(config))
+        .or_else(|| rolling_shutter(config))
         .or_else(|| lens(config))
         .or_else(|| observation(config));
     match refused {
@@ -135,6 +136,36 @@ fn brightness_events(config: &Config) -> Option<BrokenSensorRule> {
             config.run.tick_s
         ),
     ))
+}
+
+/// A rolling shutter reads all rows within one tick; a dynamic vision sensor has none.
+fn rolling_shutter(config: &Config) -> Option<BrokenSensorRule> {
+    let units = config.sensor_units(SensorKind::Camera);
+    let tick_s = config.run.tick_s;
+    units.iter().find_map(|unit| {
+        let camera = config.with_unit(unit).camera;
+        let readout_s = camera.readout_s;
+        if readout_s > tick_s {
+            return Some((
+                "camera.readout_s",
+                format!(
+                    "{} reads its rows within {readout_s} s, but a tick, `run.tick_s`, has {tick_s} s",
+                    named(unit)
+                ),
+                format!("set its readout_s to {tick_s} at most; or choose longer ticks"),
+            ));
+        }
+        (readout_s > 0.0 && camera.events).then(|| {
+            (
+                "camera.readout_s",
+                format!(
+                    "{} has a rolling shutter and events, but a dynamic vision sensor has no shutter: each pixel fires at its own time",
+                    named(unit)
+                ),
+                "set its readout_s to 0, or events = false; two sensors of a suite can have one each".into(),
+            )
+        })
+    })
 }
 
 pub(super) fn lidar(config: &Config) -> Option<BrokenSensorRule> {
