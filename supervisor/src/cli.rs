@@ -8,7 +8,7 @@ use clap::{
 };
 use ipc_schema::sensor::SensorSelection;
 
-use crate::{failure::Exit, scenario_settings};
+use crate::{failure::Exit, import::BoundingBox, scenario_settings};
 
 /// Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.
 #[derive(Debug, Parser)]
@@ -439,6 +439,7 @@ pub enum ViewerKind {
 
 const IMPORT: &str = "Examples:
   caraware import quarter.osm quarter        an extract of OpenStreetMap (its Export page, or osmium)
+  caraware import land.osm.pbf quarter --bbox 13.68,51.99,13.69,52.01
   caraware import road.xodr road --duration-s 600 --demand 2
   caraware simulate quarter/city.sumocfg
 
@@ -447,7 +448,7 @@ The map stays under its own licence: data of OpenStreetMap under the ODbL, with 
 /// Arguments of `import`.
 #[derive(Debug, Args, Clone)]
 pub struct ImportArgs {
-    /// The map: .osm, .osm.gz or .xodr
+    /// The map: .osm, .osm.gz, .osm.pbf or .xodr
     pub file: PathBuf,
     /// Where to write city.sumocfg and its files: a new or empty directory
     pub directory: PathBuf,
@@ -460,6 +461,9 @@ pub struct ImportArgs {
     /// Seed of the trips and of SUMO: the same seed gives the same trips
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(..0x8000_0000))]
     pub seed: u32,
+    /// The part of an .osm.pbf to import: degrees of west,south,east,north, such as --bbox 13.68,51.99,13.69,52.01
+    #[arg(long, value_name = "W,S,E,N", allow_hyphen_values = true)]
+    pub bbox: Option<BoundingBox>,
     /// An option for netconvert, such as --netconvert=--lefthand (repeatable)
     #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
     pub netconvert: Vec<String>,

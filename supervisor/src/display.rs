@@ -39,6 +39,58 @@ pub fn print(text: &str) {
     }
 }
 
+/// Shows how far a file has been read: nothing in the first second, then a bar on a terminal, otherwise one line every few seconds.
+#[derive(Debug)]
+pub struct FileProgress {
+    what: String,
+    /// Bytes of the file.
+    total: u64,
+    shown_at: Instant,
+    bar: Option<ProgressBar>,
+}
+
+/// Work that takes less time shows no progress.
+const SHORT_WORK: Duration = Duration::from_secs(1);
+
+impl FileProgress {
+    /// Begins with the first byte of `total`. `what` is the work and the file.
+    #[must_use]
+    pub fn new(what: String, total: u64) -> Self {
+        Self {
+            what,
+            total,
+            shown_at: Instant::now() + SHORT_WORK,
+            bar: None,
+        }
+    }
+
+    /// Shows that `bytes` have been read.
+    pub fn update(&mut self, bytes: u64) {
+        if Instant::now() < self.shown_at {
+            return;
+        }
+        if std::io::stderr().is_terminal() {
+            let bar = self.bar.get_or_insert_with(|| {
+                let bar = ProgressBar::new(self.total).with_style(style());
+                bar.set_message(self.what.clone());
+                bar
+            });
+            bar.set_position(bytes);
+        } else {
+            self.shown_at = Instant::now() + LINE_EVERY;
+            notice(&format!("{:3} % {}", bytes * 100 / self.total.max(1), self.what));
+        }
+    }
+}
+
+impl Drop for FileProgress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
 /// Shows the progress of a run.
 #[derive(Debug)]
 pub struct ProgressDisplay {

@@ -3,6 +3,7 @@
 
 mod demand;
 mod net;
+mod pbf;
 
 use std::{
     path::{Path, PathBuf},
@@ -19,11 +20,14 @@ use crate::{
     scenario::{self, ScenarioReading, input_check::require_regular},
 };
 use demand::ImportedDemand;
+pub use pbf::BoundingBox;
 
 /// The scenario in the directory.
 const SUMOCFG: &str = "city.sumocfg";
 const NET: &str = "city.net.xml";
 const POLYGONS: &str = "city.poly.xml";
+/// The map as XML, as long as SUMO's tools read it; only of PBF.
+const UNPACKED: &str = "city.osm.xml";
 /// SUMO's step, seconds.
 const STEP_S: f64 = 0.1;
 /// Simulated time of the check by bare SUMO, seconds.
@@ -34,6 +38,8 @@ const CHECKED_S: f64 = 120.0;
 pub enum MapFormat {
     /// OpenStreetMap's XML, plain or gzip.
     Osm,
+    /// OpenStreetMap's PBF, which SUMO's tools do not read: it is unpacked first.
+    OsmPbf,
     /// OpenDRIVE.
     OpenDrive,
 }
@@ -42,7 +48,7 @@ impl MapFormat {
     /// The format of a file, by its name.
     ///
     /// # Errors
-    /// The name has no known ending, or the file is one of another format that a common program converts.
+    /// The name has no known ending.
     pub fn of(file: &Path) -> Result<Self, Exit> {
         let name = file.to_string_lossy().to_ascii_lowercase();
         let ends_with = |endings: &[&str]| endings.iter().any(|ending| name.ends_with(ending));
@@ -51,15 +57,20 @@ impl MapFormat {
         } else if ends_with(&[".xodr", ".xodr.gz"]) {
             Ok(Self::OpenDrive)
         } else if ends_with(&[".pbf"]) {
-            Err(Exit::config(
-                format!("{} is packed as PBF, which SUMO's tools do not read", file.display()),
-                "unpack it first: osmium cat FILE.osm.pbf -o FILE.osm",
-            ))
+            Ok(Self::OsmPbf)
         } else {
             Err(Exit::config(
-                format!("{} is neither .osm nor .xodr", file.display()),
-                "give a map of OpenStreetMap (.osm, .osm.gz) or OpenDRIVE (.xodr)",
+                format!("{} is neither .osm, .osm.pbf nor .xodr", file.display()),
+                "give a map of OpenStreetMap (.osm, .osm.gz, .osm.pbf) or OpenDRIVE (.xodr)",
             ))
+        }
+    }
+
+    /// Whether SUMO's tools read it as a map of OpenStreetMap.
+    fn is_openstreetmap(self) -> bool {
+        match self {
+            Self::Osm | Self::OsmPbf => true,
+            Self::OpenDrive => false,
         }
     }
 }
@@ -133,6 +144,15 @@ impl SumoTools<'_> {
 /// The file is unreadable or not a map, the directory holds something else, or a tool of SUMO fails.
 pub fn import(args: &ImportArgs) -> Result<(), Exit> {
     let format = MapFormat::of(&args.file)?;
+    if args.bbox.is_some() && format != MapFormat::OsmPbf {
+        return Err(Exit::config(
+            format!(
+                "--bbox cuts a part out of an .osm.pbf, and {} is none",
+                args.file.display()
+            ),
+            "leave it out, or cut before: osmium extract -b west,south,east,north FILE.osm -o PART.osm",
+        ));
+    }
     require_regular(&args.file).map_err(|reason| {
         Exit::config(
             format!("{}: {reason}", args.file.display()),
@@ -146,12 +166,30 @@ pub fn import(args: &ImportArgs) -> Result<(), Exit> {
         install: &install,
         directory: &directory,
     };
+    let unpacked = match format {
+        MapFormat::OsmPbf => Some(pbf::unpack(&args.file, args.bbox.as_ref(), &directory.join(UNPACKED))?),
+        MapFormat::Osm | MapFormat::OpenDrive => None,
+    };
+    let map_file = match &unpacked {
+        Some(map) => {
+            display::notice(&format!(
+                "{} unpacked: {} nodes, {} ways, {} relations",
+                args.file.display(),
+                map.nodes,
+                map.ways,
+                map.relations
+            ));
+            &*map.path
+        }
+        None => &*file,
+    };
     let stage = |number: u32, what: &str| display::notice(&format!("{number}/5 {what}"));
 
     stage(1, "roads, junctions and signals (netconvert)");
-    let warnings = net::build(&tools, format, &file, NET, &args.netconvert)?;
+    let warnings = net::build(&tools, format, map_file, NET, &args.netconvert)?;
     stage(2, "buildings and trees (polyconvert)");
-    let has_polygons = format == MapFormat::Osm && net::build_polygons(&tools, &file, NET, POLYGONS)?;
+    let has_polygons = format.is_openstreetmap() && net::build_polygons(&tools, map_file, NET, POLYGONS)?;
+    drop(unpacked);
     stage(3, "demand (randomTrips)");
     let demand = ImportedDemand::write(&tools, NET, args)?;
     tools.write(SUMOCFG, &configuration(args, has_polygons, &demand))?;
@@ -323,8 +361,7 @@ mod tests {
             assert_eq!(MapFormat::of(Path::new(name)).unwrap(), MapFormat::Osm);
         }
         assert_eq!(MapFormat::of(Path::new("a.xodr")).unwrap(), MapFormat::OpenDrive);
-        let (said, help) = MapFormat::of(Path::new("a.osm.pbf")).unwrap_err().summary();
-        assert!(said.contains("PBF") && help.unwrap().contains("osmium cat"), "{said}");
+        assert_eq!(MapFormat::of(Path::new("a.osm.pbf")).unwrap(), MapFormat::OsmPbf);
         assert!(MapFormat::of(Path::new("a.net.xml")).is_err());
     }
 

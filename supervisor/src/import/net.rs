@@ -59,12 +59,12 @@ pub(super) fn build(
             .join(",")
     };
     let (input, types) = match format {
-        MapFormat::Osm => ("--osm-files", types(&OSM_TYPES)),
+        MapFormat::Osm | MapFormat::OsmPbf => ("--osm-files", types(&OSM_TYPES)),
         MapFormat::OpenDrive => ("--opendrive-files", types(&["opendriveNetconvert.typ.xml"])),
     };
     let mut arguments = vec![input, &*file, "--type-files", &*types, "--output-file", net];
     arguments.extend(ALWAYS);
-    if format == MapFormat::Osm {
+    if format.is_openstreetmap() {
         arguments.extend(OSM);
     }
     arguments.extend(more.iter().map(String::as_str));
