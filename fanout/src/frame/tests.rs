@@ -50,6 +50,33 @@ fn world_keeps_every_state_and_no_sub_step() {
 }
 
 #[test]
+fn trailing_bodies_stay_behind_the_road_users_in_a_sample_too() {
+    let mut crowd = states(8_000);
+    let trailing = crowd.split_off(6_000);
+    for state in trailing {
+        crowd.push(VehicleState {
+            kind: Kind::Trailing as u32,
+            ..state
+        });
+    }
+    let frame = encode(Channel::World, &header([6_000, 0, 0, 8_000]), cast_slice(&crowd)).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    let [road_users, _, _, bodies] = head.shape.map(|size| size as usize);
+    assert_eq!((bodies, frame.left_out), (5_920, 2_080));
+    let kinds: Vec<u32> = body
+        .chunks_exact(size_of::<VehicleState>())
+        .map(|state| pod_read_unaligned::<VehicleState>(state).kind)
+        .collect();
+    assert_eq!(kinds.len(), bodies);
+    let is_trailing = |kind: &u32| *kind == Kind::Trailing as u32;
+    assert!(!kinds[..road_users].iter().any(is_trailing) && kinds[road_users..].iter().all(is_trailing));
+    assert!(
+        (1_300..1_650).contains(&(bodies - road_users)),
+        "{road_users} of {bodies}"
+    );
+}
+
+#[test]
 fn a_crowd_is_sampled_by_id_and_counted() {
     let shown = |crowd: &[VehicleState]| -> BTreeSet<u64> {
         let count = u32::try_from(crowd.len()).unwrap();
@@ -353,9 +380,12 @@ fn a_header_that_promises_too_much_is_refused() {
     ] {
         for columns in [1, 9, u32::MAX] {
             for more in [0, 1, u32::MAX] {
-                let error = encode(channel, &header([100, columns, more, 0]), &[0; 64]).unwrap_err();
+                // The states of a world are counted by the last dimension.
+                let bodies = |rows: u32| if channel == Channel::World { rows } else { 0 };
+                let promised = |rows: u32| header([rows, columns, more, bodies(rows)]);
+                let error = encode(channel, &promised(100), &[0; 64]).unwrap_err();
                 assert!(matches!(error, FrameError::Block(_)), "{error}");
-                assert!(encode(channel, &header([u32::MAX, columns, more, 0]), &[0; 64]).is_err());
+                assert!(encode(channel, &promised(u32::MAX), &[0; 64]).is_err());
             }
         }
     }

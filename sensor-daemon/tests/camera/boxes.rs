@@ -14,9 +14,9 @@ fn visible_boxes_are_those_counted_from_the_instances() {
     let (states, _) = traffic(200, 60, Moves::Wildly, 0, 2);
     let mut scratch = CameraScratch::default();
     let mut boxes = 0;
+    let params = params(160, 100, [1.5, 0.0, 1.6, 0.0, 0.02, 0.1]);
+    let camera = CameraModel::new(&params, &config(), &scene);
     for row in 0..30 {
-        let params = params(160, 100, [1.5, 0.0, 1.6, 0.0, 0.02, 0.1]);
-        let camera = CameraModel::new(&params, &config(), &scene);
         let (taken, _) = take(&camera, &states, row, &mut scratch);
         boxes += check(&taken, &states, 160, 0.01);
     }
