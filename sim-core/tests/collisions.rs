@@ -8,7 +8,7 @@ use ipc_schema::{
     event::{Collision, Struck},
     props::PropKind,
     traffic::{Kind, id_hash},
-    world::{COLLIDED, VehicleState},
+    world::{COLLIDED, VehicleState, trailing_index},
 };
 use parry3d_f64::{
     math::{Pose, Vector},
@@ -373,4 +373,46 @@ fn events_are_the_same_in_every_run_and_sorted() {
             .iter()
             .all(|tick| tick.is_sorted_by_key(|event| (event.vehicle, event.other_class, event.other)))
     );
+}
+
+/// A trailing body of a vehicle, its middle at (x, y).
+fn trailing(of: u32, place: u32, x_m: f64, y_m: f64) -> VehicleState {
+    VehicleState {
+        vehicle: trailing_index(of, place),
+        kind: Kind::Trailing as u32,
+        ..vehicle(of, Kind::Other, x_m, y_m)
+    }
+}
+
+#[test]
+fn a_vehicle_touches_with_any_of_its_bodies_and_they_do_not_touch_each_other() {
+    // A train without sensors, whose bodies overlap at the joints, and a car with sensors that meets its last one.
+    let bodies = |car_x_m: f64| {
+        vec![
+            vehicle(0, Kind::Cav, car_x_m, 0.0),
+            vehicle(1, Kind::Other, 0.0, 0.0),
+            trailing(1, 1, -4.0, 0.0),
+            trailing(1, 2, -8.0, 0.0),
+        ]
+    };
+    let mut detector = empty();
+    assert_eq!(tick(&mut detector, 0, bodies(-20.0)).0, []);
+    let (begun, flagged) = tick(&mut detector, 0, bodies(-11.0));
+    let pairs: Vec<(u32, u32)> = begun.iter().map(|contact| (contact.vehicle, contact.other)).collect();
+    assert_eq!(pairs, [(0, 1)], "the vehicles, and once");
+    assert_eq!(flagged, [0, 1]);
+    assert!(begun[0].position_m[0] < -8.0, "{:?}", begun[0].position_m);
+    // Farther in it touches two of them: the contact lasts, and nothing begins.
+    assert_eq!(tick(&mut detector, 0, bodies(-6.0)).0, []);
+    // A connected vehicle's own bodies count as itself.
+    let mut own = empty();
+    let states = vec![
+        vehicle(0, Kind::Cav, 0.0, 0.0),
+        vehicle(1, Kind::Other, -9.0, 0.0),
+        trailing(0, 1, -4.0, 0.0),
+        trailing(0, 2, -8.0, 0.0),
+    ];
+    let (begun, flagged) = tick(&mut own, 0, states);
+    assert_eq!((begun.len(), flagged), (1, vec![0, 1]));
+    assert_eq!((begun[0].vehicle, begun[0].other), (0, 1));
 }

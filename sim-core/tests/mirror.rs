@@ -8,8 +8,8 @@ use common::{LENGTH_M, Road, drive, frame, limits, meta, previewing, settings};
 use ipc_schema::{
     config,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
-    traffic::{Kind, MetaEvent, TrafficState},
-    world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState},
+    traffic::{Kind, MetaEvent, TrafficState, VehicleMeta},
+    world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState, trailing_index, vehicle_of},
 };
 use proptest::prelude::*;
 use sim_core::{
@@ -367,4 +367,56 @@ fn a_vehicle_that_changes_lanes_while_it_stands_is_led_there() {
     let end = states.last().unwrap();
     assert!(front_from(end, [60.0, 3.2]) < 0.3, "{end:?}");
     assert_eq!(end.flags & GUIDED, 0);
+}
+
+/// An announcement of a semi-trailer truck.
+fn truck(vehicle: u32) -> VehicleMeta {
+    let mut announced = meta(vehicle, Kind::Cav);
+    announced.vehicle_class = Default::default();
+    announced.vehicle_class[..7].copy_from_slice(b"trailer");
+    (announced.length_m, announced.width_m, announced.height_m) = (16.5, 2.55, 4.0);
+    announced
+}
+
+#[test]
+fn trailing_bodies_follow_all_road_users_and_those_without_room_are_left_out() {
+    let settings = MirrorSettings {
+        most_trailing: 2,
+        ..settings(0.1, 10, 1)
+    };
+    let mut mirror = Mirror::new(settings).unwrap();
+    let metas = [truck(0), meta(1, Kind::Cav), truck(2), truck(3)];
+    mirror.apply_meta(&header(0, 0), &metas).unwrap();
+    let at = |vehicle: u32, tick: u64| {
+        let place_m = 100.0 + 40.0 * f64::from(vehicle) + 0.8 * tick as f64;
+        road().state(vehicle, place_m, 8.0)
+    };
+    let bodies = |mirror: &mut Mirror, tick: u64, vehicles: &[u32]| -> (Vec<u32>, Vec<VehicleState>) {
+        let states: Vec<TrafficState> = vehicles.iter().map(|vehicle| at(*vehicle, tick)).collect();
+        let states = frame(mirror, &header(0, tick), &states).remove(0).states;
+        assert!(
+            states[..vehicles.len()]
+                .iter()
+                .map(|state| state.vehicle)
+                .eq(vehicles.iter().copied())
+        );
+        let trailing = states[vehicles.len()..].to_vec();
+        (trailing.iter().map(|state| state.vehicle).collect(), states)
+    };
+    for tick in 0..10 {
+        let (trailing, states) = bodies(&mut mirror, tick, &[0, 1, 2, 3]);
+        assert_eq!(trailing, [trailing_index(0, 1), trailing_index(2, 1)]);
+        let behind: Vec<u32> = states.iter().map(|state| state.trailing).collect();
+        assert_eq!(behind, [1, 0, 1, 0, 0, 0]);
+        assert_eq!(vehicle_of(trailing[1]), 2);
+    }
+    // When the first truck has left, the last one has its trailer, right behind it.
+    for tick in 10..14 {
+        let (trailing, states) = bodies(&mut mirror, tick, &[1, 2, 3]);
+        assert_eq!(trailing, [trailing_index(2, 1), trailing_index(3, 1)]);
+        let (cab, trailer) = (&states[2], &states[4]);
+        let kingpin_m = trailer.x_m + f64::from(trailer.wheelbase_m);
+        assert!((kingpin_m - cab.x_m - 0.6).abs() < 1e-4, "{kingpin_m} {}", cab.x_m);
+        assert_eq!(trailer.kind, Kind::Trailing as u32);
+    }
 }

@@ -1,4 +1,7 @@
-use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
+use ipc_schema::{
+    traffic::{NO_SIGNAL, RoutePoint},
+    world::{SENSING_M, USER_COLUMNS, trailing_index},
+};
 
 use super::*;
 
@@ -104,6 +107,32 @@ fn a_hero_sees_its_route_what_is_on_it_and_the_signal() {
     assert_eq!(
         (view.signal_gap_m, view.leader_gap_m, view.leader_speed_mps),
         (100.0, 100.0, 0.0)
+    );
+}
+
+/// A leader's trailer is nearer than the leader, and a hero's own bodies are not in its way.
+#[test]
+fn a_hero_sees_the_trailer_ahead_and_not_its_own() {
+    let mut driving = driving();
+    let trailing = |of: u32, x_m: f64| VehicleState {
+        vehicle: trailing_index(of, 1),
+        kind: Kind::Trailing as u32,
+        ..car(of, Kind::Other, x_m, 0.0)
+    };
+    let mut states = [
+        car(3, Kind::Hero, 10.0, 0.0),
+        car(4, Kind::Other, 65.0, 0.0),
+        trailing(3, 5.0),
+        trailing(4, 41.0),
+    ];
+    let (view, _) = tick(&mut driving, &mut states);
+    // Rear end of the trailer at 40 m, front bumper of the hero at 14 m.
+    assert_eq!(view.leader_gap_m, 26.0);
+    // Middles: the trailer's at 42.5 m, the leader's at 66.5 m, out of sight.
+    let users = view.around.as_chunks::<USER_COLUMNS>().0;
+    assert_eq!(
+        [users[0][0], users[1][0], users[2][0]],
+        [32.5, SENSING_M as f32, SENSING_M as f32]
     );
 }
 

@@ -62,6 +62,11 @@ impl TrailingChain {
         self.shape.count() as usize
     }
 
+    /// The bodies are not in the message of a tick: they appear anew.
+    pub(super) fn forget(&mut self) {
+        self.poses.clear();
+    }
+
     /// Moves the bodies to the end of a tick of `tick_s`, through which the leading body has moved as `leading` and `steps` say, and
     /// writes them into `out`, which has [`TrailingChain::count`] places. The leading body of a vehicle on rails is put onto them.
     pub(super) fn write_tick(

@@ -479,10 +479,14 @@ impl Mirror {
         mut trailing: &mut [VehicleState],
     ) {
         let (per_tick, tick_s) = (self.settings.sub_steps as usize, self.settings.tick_s);
-        let written: Vec<(u32, usize)> = self.chains_of(tick).collect();
-        for (vehicle, count) in written {
-            let row = states.binary_search_by_key(&vehicle, |state| state.vehicle);
-            let (Ok(row), Some(chain)) = (row, self.chains.get_mut(&vehicle)) else {
+        if self.chains.is_empty() {
+            return;
+        }
+        let written: BTreeMap<u32, usize> = self.chains_of(tick).collect();
+        for (vehicle, chain) in &mut self.chains {
+            let row = states.binary_search_by_key(vehicle, |state| state.vehicle);
+            let (Ok(row), Some(&count)) = (row, written.get(vehicle)) else {
+                chain.forget();
                 continue;
             };
             let (bodies, rest) = std::mem::take(&mut trailing).split_at_mut(count);
