@@ -27,6 +27,7 @@ NEVER_RUN = {
     "docs/tutorials/many-machines.md": 1,
     "docs/tutorials/watch-from-a-laptop.md": 2,
     "docs/extending.md": 1,
+    "docs/import.md": 1,
     "docs/install.md": 3,
     "docs/parallel.md": 1,
     "docs/remote.md": 4,

@@ -51,7 +51,7 @@ fn frames_are_the_bytes_of_shared_memory() {
         let (header, payload) = next(&world);
         assert_eq!(
             (header.tick, header.shape, header.run_id),
-            (tick, [5, 0, 0, 0], run.file.run_id)
+            (tick, [5, 0, 0, 5], run.file.run_id)
         );
         assert_eq!(payload, cast_slice::<_, u8>(&states(tick, 5)));
         let (header, payload) = next(&seen);
