@@ -47,7 +47,9 @@ def kinds(states: NDArray[np.void]) -> NDArray[np.uint32]:
         leading = {int(state["vehicle"]): int(state["kind"]) for state in states[states["trailing"] > 0]}
         owners = states["vehicle"][trailing] & ((1 << wire.BODY_SHIFT) - 1)
         kinds[trailing] = [leading.get(int(owner), wire.OTHER) for owner in owners]
-    return kinds
+    # A frame may have kinds of a later program.
+    known: NDArray[np.uint32] = np.minimum(kinds, wire.HERO)
+    return known
 
 
 def blinkers_m(states: NDArray[np.void]) -> NDArray[np.float32]:
