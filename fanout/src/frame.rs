@@ -12,7 +12,7 @@ use ipc_schema::{
     radar::{RadarDetection, RadarLayout, RadarScan},
     services::Channel,
     traffic::Kind,
-    world::{VehicleState, WorldLayout},
+    world::{VehicleState, WorldLayout, road_users_of},
 };
 
 mod image;
@@ -289,7 +289,7 @@ fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, 
 
 /// Header and states: road users and, behind them, trailing bodies.
 fn world_frame(header: &MessageHeader, states: &[VehicleState]) -> EncodedFrame {
-    let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+    let road_users = road_users_of(states).len();
     let header = MessageHeader {
         shape: WorldLayout::with_heroes(road_users, 0, 0, states.len() - road_users).shape,
         ..*header

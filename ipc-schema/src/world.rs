@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::{block::Section, section::payload_layout};
+use crate::{block::Section, section::payload_layout, traffic::Kind};
 
 /// The pose was set instead of reached by motion: insertion, teleport or resynchronisation.
 pub const RESYNCHRONISED: u32 = 1;
@@ -48,6 +48,12 @@ pub const fn trailing_index(vehicle: u32, place: u32) -> u32 {
 #[must_use]
 pub const fn vehicle_of(body: u32) -> u32 {
     body & ((1 << BODY_SHIFT) - 1)
+}
+
+/// The road users among the states of a `world` message: those before the trailing bodies.
+#[must_use]
+pub fn road_users_of(states: &[VehicleState]) -> &[VehicleState] {
+    &states[..states.partition_point(|state| state.kind != Kind::Trailing as u32)]
 }
 
 /// Trailing bodies that a `world` message of `road_users` has room for. The bodies of the last vehicles are left out beyond that.

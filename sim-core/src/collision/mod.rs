@@ -10,7 +10,7 @@ use std::sync::Arc;
 use ipc_schema::{
     event::{Collision, Struck},
     traffic::{Kind, id_hash},
-    world::{COLLIDED, VehicleState, vehicle_of},
+    world::{COLLIDED, VehicleState, road_users_of, vehicle_of},
 };
 
 use crate::scene::{
@@ -273,9 +273,8 @@ impl CollisionDetector {
 
 /// Row of the vehicle that a trailing body belongs to.
 fn owner_of(body: &VehicleState, states: &[VehicleState]) -> Option<u32> {
-    let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
     let vehicle = vehicle_of(body.vehicle);
-    let row = states[..road_users].binary_search_by_key(&vehicle, |state| state.vehicle);
+    let row = road_users_of(states).binary_search_by_key(&vehicle, |state| state.vehicle);
     row.ok().map(|row| row as u32)
 }
 

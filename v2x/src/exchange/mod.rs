@@ -10,7 +10,7 @@ use ipc_schema::{
     neighbours::{ACHIEVED_COLUMNS, NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     observation::EMPTY_SLOT,
     traffic::Kind,
-    world::VehicleState,
+    world::{VehicleState, road_users_of},
 };
 use serde::{Deserialize, Serialize};
 use sim_core::{geodesy::Projection, scene::Scene};
@@ -630,11 +630,6 @@ fn nearest_views<'a>(
     all.sort_by(|a, b| a.0.total_cmp(&b.0));
     nearest.clear();
     nearest.extend(all.into_iter().take(count).map(|(_, view)| view));
-}
-
-/// The first of the states of a `world` message: road users without trailing bodies.
-fn road_users_of(states: &[VehicleState]) -> &[VehicleState] {
-    &states[..states.partition_point(|state| state.kind != Kind::Trailing as u32)]
 }
 
 fn size_of(state: &VehicleState) -> VehicleSize {

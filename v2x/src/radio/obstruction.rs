@@ -2,7 +2,10 @@
 
 use std::ops::{ControlFlow, Range};
 
-use ipc_schema::{traffic::Kind, world::VehicleState};
+use ipc_schema::{
+    traffic::Kind,
+    world::{VehicleState, road_users_of},
+};
 use sim_core::scene::{
     Grid, Scene,
     shape::{Bounds, OrientedBox, Point, cross, dot, edges, from_to},
@@ -129,7 +132,7 @@ impl Obstacles {
 
     /// Takes the road users of a tick, and the trailing bodies behind them.
     pub fn update(&mut self, states: &[VehicleState]) {
-        self.road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+        self.road_users = road_users_of(states).len();
         self.bodies.clear();
         self.bodies.extend(states.iter().map(body_of));
         self.circles.clear();

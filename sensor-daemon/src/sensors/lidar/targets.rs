@@ -3,7 +3,7 @@
 use ipc_schema::{
     pointcloud::Tag,
     traffic::Kind,
-    world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState},
+    world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState, road_users_of},
 };
 
 use super::solids::INTEREST;
@@ -83,7 +83,7 @@ impl Targets {
     /// Replaces the targets by those of a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. Trailing bodies,
     /// behind the road users, have no sub-steps: they move evenly through the tick. With `k` = 0 nothing moves.
     pub fn update(&mut self, states: &[VehicleState], sub_steps: &[SubStep], k: usize) {
-        let road_users = states.partition_point(|state| state.kind != Kind::Trailing as u32);
+        let road_users = road_users_of(states).len();
         let k = if sub_steps.len() < road_users * k { 0 } else { k };
         self.sub_steps = k;
         self.knots.clear();
