@@ -211,6 +211,8 @@ pub struct RunConfig {
     pub stall_s: f64,
     /// What happens to a process that hangs.
     pub on_stall: StallAction,
+    /// Longest time from the start of a process to its readiness, seconds.
+    pub ready_s: f64,
 }
 
 /// What happens to a process that hangs.

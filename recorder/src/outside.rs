@@ -63,7 +63,7 @@ pub fn record(
             path,
             RecordingStart::of(run, names, false),
             &first_attachments(run),
-            [record.compression_level, record.chunk_mib],
+            record.into(),
         )
         .map_err(file_failed)?,
     );

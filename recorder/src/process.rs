@@ -18,7 +18,10 @@ use ipc_schema::{
 use serde::Serialize;
 
 use crate::{
-    file::{RECORDING, RecordingError, RecordingStart, writer::RecordingWriter},
+    file::{
+        RECORDING, RecordingError, RecordingStart,
+        writer::{ChunkOptions, RecordingWriter},
+    },
     intake::{ChannelIntake, IntakeError},
     run_logs::{RunLogs, first_attachments},
 };
@@ -132,7 +135,7 @@ impl RunRecorder {
         let start = RecordingStart::of(&run, names, record.manner == RecordManner::Lossless);
         let path = free_path(&run.run_dir)
             .ok_or_else(|| Failure::new(FailureKind::Run, "the run directory has too many recordings"))?;
-        let options = [record.compression_level, record.chunk_mib];
+        let options = ChunkOptions::from(record);
         let producers = [
             Process::TrafficBridge,
             Process::SimCore,
@@ -165,7 +168,7 @@ impl RunRecorder {
         path: &Path,
         start: &RecordingStart,
         run: &RunFile,
-        options: [u32; 2],
+        options: ChunkOptions,
     ) -> Result<(), Failure> {
         let attachments = first_attachments(run);
         loop {

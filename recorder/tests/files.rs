@@ -14,13 +14,17 @@ use recorder::{
     file::{
         RECORDING_VERSION, RecordingError, RecordingStart,
         reader::{ChannelMessage, RecordedMessage, RecordingReader},
-        writer::{LineTopic, RecordingWriter},
+        writer::{ChunkOptions, LineTopic, RecordingWriter},
     },
 };
 
 const TICKS: u64 = 60;
 /// Ticks in a chunk.
 const CHUNK: u64 = 7;
+const CHUNKS: ChunkOptions = ChunkOptions {
+    compression_level: 1,
+    chunk_mib: 4,
+};
 
 fn start(schema_version: u32) -> RecordingStart {
     RecordingStart {
@@ -67,8 +71,17 @@ fn observation(
 
 /// Writes a recording of [`TICKS`] ticks in chunks of [`CHUNK`]; `change` alters the payload of a tick.
 fn write(path: &Path, is_finished: bool, change: impl Fn(u64, &mut [u8], &ObservationLayout)) {
+    write_packed(path, is_finished, CHUNKS, change);
+}
+
+fn write_packed(
+    path: &Path,
+    is_finished: bool,
+    chunks: ChunkOptions,
+    change: impl Fn(u64, &mut [u8], &ObservationLayout),
+) {
     let attachments = [("run.json".to_owned(), b"{}".to_vec())];
-    let mut writer = RecordingWriter::create(path, start(SCHEMA_VERSION), &attachments, [1, 4]).unwrap();
+    let mut writer = RecordingWriter::create(path, start(SCHEMA_VERSION), &attachments, chunks).unwrap();
     for tick in 0..TICKS {
         let (header, payload) = observation(tick, 3, |payload, layout| change(tick, payload, layout));
         writer.add(Channel::Observation, &header, &payload).unwrap();
@@ -108,6 +121,29 @@ fn read(path: &Path) -> (Vec<RecordedMessage>, Option<RecordingError>) {
 
 fn place(directory: &tempfile::TempDir, name: &str) -> PathBuf {
     directory.path().join(name)
+}
+
+#[test]
+fn a_level_changes_the_size_of_a_recording_and_nothing_else() {
+    let directory = tempfile::tempdir().unwrap();
+    let packed = [-50, -3, 0, 1, 19].map(|compression_level| {
+        let path = place(&directory, &format!("level{compression_level}.mcap"));
+        let chunks = ChunkOptions {
+            compression_level,
+            ..CHUNKS
+        };
+        // Half of each observation repeats, so that there is something to find.
+        write_packed(&path, true, chunks, |_, payload, _| {
+            let (first, second) = payload.split_at_mut(payload.len() / 2);
+            second.copy_from_slice(&first[..second.len()]);
+        });
+        let (messages, damage) = read(&path);
+        assert!(damage.is_none(), "{compression_level}: {damage:?}");
+        (messages, path.metadata().unwrap().len())
+    });
+    let [(messages, fastest), .., (_, smallest)] = &packed;
+    assert!(packed.iter().all(|(other, _)| other == messages));
+    assert!(fastest > smallest, "{fastest} and {smallest} bytes");
 }
 
 #[test]
@@ -243,7 +279,7 @@ fn a_recording_of_another_schema_is_refused_with_both_versions() {
     let directory = tempfile::tempdir().unwrap();
     let path = place(&directory, "old.mcap");
     let old = SCHEMA_VERSION - 1;
-    RecordingWriter::create(&path, start(old), &[], [1, 4])
+    RecordingWriter::create(&path, start(old), &[], CHUNKS)
         .unwrap()
         .finish(0)
         .unwrap();
@@ -253,7 +289,7 @@ fn a_recording_of_another_schema_is_refused_with_both_versions() {
         "{said}"
     );
     // A file that exists is not overwritten.
-    assert!(RecordingWriter::create(&path, start(old), &[], [1, 4]).is_err() && path.exists());
+    assert!(RecordingWriter::create(&path, start(old), &[], CHUNKS).is_err() && path.exists());
 }
 
 #[test]
@@ -293,7 +329,7 @@ fn the_difference_names_tick_section_row_and_values() {
     }
     // A recording that began later differs only in what it lacks from then on.
     let late = place(&directory, "late.mcap");
-    let mut writer = RecordingWriter::create(&late, start(SCHEMA_VERSION), &[], [1, 4]).unwrap();
+    let mut writer = RecordingWriter::create(&late, start(SCHEMA_VERSION), &[], CHUNKS).unwrap();
     for tick in 20..TICKS {
         let (header, payload) = observation(tick, 3, |_, _| {});
         writer.add(Channel::Observation, &header, &payload).unwrap();

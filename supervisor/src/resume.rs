@@ -29,7 +29,7 @@ use crate::{
 const FORMER_PROCESSES_END_WITHIN: Duration = Duration::from_secs(30);
 
 /// Keys, or prefixes of keys, that a resumed run may change: no observation made so far depends on them.
-const CHANGEABLE: [&str; 9] = [
+const CHANGEABLE: [&str; 10] = [
     "trainer.",
     "fanout.",
     "run.journal_mib",
@@ -37,6 +37,7 @@ const CHANGEABLE: [&str; 9] = [
     "run.real_time_factor",
     "run.stall_s",
     "run.on_stall",
+    "run.ready_s",
     "episode.training_episodes",
     "episode.final_evaluations",
 ];

@@ -9,12 +9,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::process::Process;
+use ipc_schema::{config::RunConfig, process::Process};
 
 /// Most time that counts between two checks.
 const LONGEST_COUNTED: Duration = Duration::from_millis(500);
-/// Longest time from the start of a process to its readiness.
-pub const READY_WITHIN: Duration = Duration::from_secs(120);
 
 /// A process of a run and its environment.
 pub type ProcessPlace = (Process, u32);
@@ -70,16 +68,19 @@ struct Silence {
 pub struct StallWatch {
     /// `run.stall_s`.
     limit: Duration,
+    /// `run.ready_s`, for processes that start.
+    ready_limit: Duration,
     last_check: Instant,
     silences: BTreeMap<ProcessPlace, Silence>,
 }
 
 impl StallWatch {
-    /// A watch for processes that give no sign of life for `stall_s` seconds.
+    /// A watch for processes that give no sign of life for `run.stall_s`, or `run.ready_s` from their start.
     #[must_use]
-    pub fn new(stall_s: f64, now: Instant) -> Self {
+    pub fn new(run: &RunConfig, now: Instant) -> Self {
         Self {
-            limit: Duration::from_secs_f64(stall_s),
+            limit: Duration::from_secs_f64(run.stall_s),
+            ready_limit: Duration::from_secs_f64(run.ready_s),
             last_check: now,
             silences: BTreeMap::new(),
         }
@@ -113,7 +114,7 @@ impl StallWatch {
         silence.passed += passed;
         let queued = sign.queued.saturating_sub(silence.queued);
         silence.lasts = silence.passed.saturating_sub(queued);
-        let limit = if sign.is_starting { READY_WITHIN } else { self.limit };
+        let limit = if sign.is_starting { self.ready_limit } else { self.limit };
         if silence.is_stall || silence.lasts < limit {
             return None;
         }
@@ -139,6 +140,16 @@ mod tests {
     const CORE: ProcessPlace = (Process::SimCore, 0);
     const CHECK: Duration = Duration::from_millis(100);
 
+    /// A watch with `run.stall_s` = 2 and `run.ready_s` = 40.
+    fn watch(now: Instant) -> StallWatch {
+        StallWatch {
+            limit: Duration::from_secs(2),
+            ready_limit: Duration::from_secs(40),
+            last_check: now,
+            silences: BTreeMap::new(),
+        }
+    }
+
     fn sign(noted_ns: u64) -> LifeSign {
         LifeSign {
             place: CORE,
@@ -162,7 +173,7 @@ mod tests {
     #[test]
     fn a_process_without_a_sign_of_life_hangs_until_the_next_sign() {
         let mut now = Instant::now();
-        let mut watch = StallWatch::new(2.0, now);
+        let mut watch = watch(now);
         assert_eq!(repeat(&mut watch, &mut now, 15, sign(1)), []);
         assert_eq!(repeat(&mut watch, &mut now, 15, sign(2)), [], "a sign of life");
         let silence = Duration::from_secs(2);
@@ -181,7 +192,7 @@ mod tests {
     #[test]
     fn a_process_that_is_excused_or_replaced_does_not_hang() {
         let mut now = Instant::now();
-        let mut watch = StallWatch::new(2.0, now);
+        let mut watch = watch(now);
         let excused = LifeSign {
             is_excused: true,
             ..sign(1)
@@ -194,8 +205,8 @@ mod tests {
             is_starting: true,
             ..sign(1)
         };
-        assert_eq!(repeat(&mut watch, &mut now, 1000, next), [], "it starts");
-        let late = repeat(&mut watch, &mut now, 1000, next);
+        assert_eq!(repeat(&mut watch, &mut now, 390, next), [], "it starts");
+        let late = repeat(&mut watch, &mut now, 20, next);
         assert!(
             matches!(late[..], [StallChange::Begins { is_starting: true, .. }]),
             "{late:?}"
@@ -207,7 +218,7 @@ mod tests {
     #[test]
     fn the_time_in_which_a_process_gets_no_core_does_not_count() {
         let mut now = Instant::now();
-        let mut watch = StallWatch::new(2.0, now);
+        let mut watch = watch(now);
         for check in 1..=1000 {
             let starved = LifeSign {
                 queued: CHECK * check,
@@ -229,7 +240,7 @@ mod tests {
     #[test]
     fn the_time_in_which_the_supervisor_itself_was_stopped_does_not_count() {
         let mut now = Instant::now();
-        let mut watch = StallWatch::new(2.0, now);
+        let mut watch = watch(now);
         assert_eq!(repeat(&mut watch, &mut now, 10, sign(1)), []);
         now += Duration::from_secs(3600);
         assert_eq!(watch.check(now, &[sign(1)]), []);

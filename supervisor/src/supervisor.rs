@@ -35,7 +35,7 @@ use crate::{
     registry::{self, RunClaim},
     restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts, lost_another},
     socket::{self, HandoverReport, ReceivedRequest},
-    stall::{ProcessPlace, READY_WITHIN, StallChange, StallWatch},
+    stall::{ProcessPlace, StallChange, StallWatch},
     status::last_work,
 };
 
@@ -159,7 +159,7 @@ impl Supervisor {
             watcher_restarts: BTreeMap::new(),
             trainer_restarts: RequiredRestarts::default(),
             environment_restarts: BTreeMap::new(),
-            stalls: StallWatch::new(run.config.run.stall_s, Instant::now()),
+            stalls: StallWatch::new(&run.config.run, Instant::now()),
             killed_for_cause: BTreeSet::new(),
             memory_kills: memory.kills(),
             memory,
@@ -346,7 +346,10 @@ impl Supervisor {
         };
         let (row, label, state) = self.processes.describe(index);
         let what = match is_starting {
-            true => format!("{label} was not ready within {} s", READY_WITHIN.as_secs()),
+            true => format!(
+                "{label} was not ready within {} s",
+                self.processes.run().config.run.ready_s
+            ),
             false => format!("{label} has made no progress for {:.0} s", silence.as_secs_f64()),
         };
         let run = self.processes.run();
@@ -527,16 +530,19 @@ impl Supervisor {
         }
         match self.processes.first_not_ready() {
             None => self.ready_at = Some(self.last_check),
-            Some((row, environment)) if started.elapsed() > READY_WITHIN => {
+            Some((row, environment)) if started.elapsed().as_secs_f64() > environment.run.config.run.ready_s => {
                 let log = environment
                     .run
                     .run_dir
                     .join("logs")
                     .join(format!("{}.log", row.process));
                 let name = row.label(&environment.run);
-                let message = format!("{name} was not ready within {} s", READY_WITHIN.as_secs());
+                let message = format!("{name} was not ready within {} s", environment.run.config.run.ready_s);
                 return Err(Failure::new(FailureKind::Run, message)
-                    .with_help(format!("its log is {}", log.display()))
+                    .with_help(format!(
+                        "its log is {}; a larger run.ready_s waits for longer",
+                        log.display()
+                    ))
                     .into());
             }
             Some(_) => {}

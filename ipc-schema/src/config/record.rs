@@ -12,8 +12,8 @@ pub struct RecordConfig {
     pub manner: RecordManner,
     /// Names of the recorded channels.
     pub channels: Vec<String>,
-    /// Level of zstd.
-    pub compression_level: u32,
+    /// Level of zstd, which has negative ones too.
+    pub compression_level: i32,
     /// Uncompressed size of a chunk, MiB: the most that a kill loses.
     pub chunk_mib: u32,
     /// What happens while the disk is full.

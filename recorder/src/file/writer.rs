@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{channel::Channel, digest::ObservationDigest, header::MessageHeader, layout};
+use ipc_schema::{channel::Channel, config::RecordConfig, digest::ObservationDigest, header::MessageHeader, layout};
 use mcap::{Attachment, WriteOptions, Writer, records::MessageHeader as McapMessageHeader, write::NoSeek};
 
 use super::{
@@ -37,7 +37,11 @@ struct PendingBytes(Arc<Mutex<Vec<u8>>>);
 impl PendingBytes {
     /// Moves the bytes behind those of `unwritten`. Both keep their memory: without it each chunk would ask the system for new pages.
     fn move_to(&self, unwritten: &mut Vec<u8>) {
-        unwritten.append(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        match unwritten.is_empty() {
+            true => std::mem::swap(unwritten, &mut pending),
+            false => unwritten.append(&mut pending),
+        }
     }
 }
 
@@ -72,6 +76,24 @@ impl LineTopic {
         match self {
             Self::Commands => "commands",
             Self::Curriculum => "curriculum",
+        }
+    }
+}
+
+/// How messages are packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ChunkOptions {
+    /// Level of zstd. Those below 0 are faster, and 0 is zstd's own default.
+    pub compression_level: i32,
+    /// Size of a chunk before compression, MiB.
+    pub chunk_mib: u32,
+}
+
+impl From<&RecordConfig> for ChunkOptions {
+    fn from(record: &RecordConfig) -> Self {
+        Self {
+            compression_level: record.compression_level,
+            chunk_mib: record.chunk_mib,
         }
     }
 }
@@ -114,14 +136,14 @@ impl RecordingWriter {
         path: &Path,
         start: RecordingStart,
         attachments: &[(String, Vec<u8>)],
-        [compression_level, chunk_mib]: [u32; 2],
+        chunks: ChunkOptions,
     ) -> Result<Self, RecordingError> {
         let created = OpenOptions::new().write(true).create_new(true).open(path);
         let file = created.map_err(|source| RecordingError::Io {
             path: path.into(),
             source,
         })?;
-        let writer = Self::begin(path, file, start, attachments, [compression_level, chunk_mib]);
+        let writer = Self::begin(path, file, start, attachments, chunks);
         if writer.is_err()
             && let Err(error) = std::fs::remove_file(path)
         {
@@ -135,13 +157,14 @@ impl RecordingWriter {
         file: File,
         start: RecordingStart,
         attachments: &[(String, Vec<u8>)],
-        [compression_level, chunk_mib]: [u32; 2],
+        chunks: ChunkOptions,
     ) -> Result<Self, RecordingError> {
         let pending = PendingBytes::default();
         let options = WriteOptions::new()
             .profile(PROFILE)
             .library(concat!("caraware ", env!("CARGO_PKG_VERSION")))
-            .compression_level(compression_level)
+            // The library passes the level on as a signed number.
+            .compression_level(chunks.compression_level.cast_unsigned())
             .compression_threads(compression_threads())
             .chunk_size(None)
             .disable_seeking(true);
@@ -195,7 +218,7 @@ impl RecordingWriter {
             chunk_topic,
             chunks: 0,
             filling: None,
-            chunk_bytes: (chunk_mib as usize) << 20,
+            chunk_bytes: (chunks.chunk_mib as usize) << 20,
             encoded: Vec::new(),
             digest: ObservationDigest::default(),
             messages: [0; Channel::COUNT],

@@ -19,8 +19,6 @@ use crate::{
     socket::{HandoverAnswer, HandoverReport, HandoverRequest, Permission, ReplySocket},
 };
 
-/// Longest time from the start of a successor to its readiness.
-const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Name under which a successor writes its failure, beside the other logs.
 const SUCCESSOR: &str = "successor";
 
@@ -127,7 +125,7 @@ impl HandoverInProgress {
         let (successor, limit, what) = match &mut self.phase {
             HandoverPhase::GettingReady { successor } => (
                 successor,
-                Some(asked.unwrap_or(READY_WITHIN)),
+                Some(asked.unwrap_or_else(|| Duration::from_secs_f64(self.run.config.run.ready_s))),
                 "the successor was not ready",
             ),
             // A trainer that does not get ready is killed, and the successor takes over.

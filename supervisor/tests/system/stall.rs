@@ -248,6 +248,29 @@ fn a_stall_is_reported_and_a_pause_or_a_stopped_supervisor_is_none() {
     assert_same(&workplace, 0);
 }
 
+/// The start has a deadline: a process that is not ready in time is named and killed, and the run ends with a report.
+#[test]
+fn a_process_that_is_not_ready_in_time_ends_the_run() {
+    let workplace = Workplace::new();
+    let module = "import time\n\ntime.sleep(1e6)\n";
+    std::fs::write(workplace.path().join("sleeper.py"), module).unwrap();
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let mut command = workplace.command(&arguments("late", &["trainer.module=sleeper", "run.ready_s=15"]));
+    command.env("PYTHONPATH", format!("{}:{python}", workplace.path().display()));
+    let output = command.output().unwrap();
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("trainer was not ready within 15 s"), "{said}");
+    assert!(
+        said.contains("logs/trainer.log") && said.contains("run.ready_s"),
+        "{said}"
+    );
+    let report = workplace.report("late");
+    assert_eq!(report["result"], "failed", "{report:#}");
+    assert!(report["failure"].to_string().contains("not ready"), "{report:#}");
+    workplace.assert_nothing_left();
+}
+
 /// The shutdown has a deadline: a process that does not end when it is asked to is named and killed.
 #[test]
 fn a_process_that_does_not_end_in_time_is_named_and_killed() {
