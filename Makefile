@@ -16,7 +16,7 @@ PREFIX ?=
 EXTRAS ?= envs,data,metrics,study
 
 .PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
-	timed-packages timed-programs with-cuda newcomer model deny bench peers peers-metadrive peers-smarts faces site clean
+	timed-packages timed-programs with-cuda newcomer model miri deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -129,7 +129,9 @@ test-python:
 newcomer: build ## every command block of README and docs, also those that the tests only parse: about a quarter of an hour
 	$(VENV)/bin/python scripts/newcomer.py --all
 
-# The tests look at fewer deaths, preemptions and frames. Miri needs a nightly toolchain: rustup toolchain install nightly --component miri,rust-src
+MIRI = cd sensor-daemon/tests/miri && MAKEFLAGS= RUSTFLAGS=-Ctarget-feature=+avx2 CARGO_TARGET_DIR=$(CURDIR)/target/miri cargo +nightly miri test
+
+# The tests look at fewer deaths, preemptions and frames.
 model: prerequisites $(VENV)/.installed ## the models and the parsers for longer than in the tests, the unsafe parts under Miri: about an hour
 	CARAWARE_MODEL_DEATHS=3,3 $(CARGO) test $(CARGO_FLAGS) --test protocol_model
 	CARAWARE_LOOM_PREEMPTIONS=4 $(CARGO) test $(CARGO_FLAGS) --test boards_under_loom
@@ -137,10 +139,11 @@ model: prerequisites $(VENV)/.installed ## the models and the parsers for longer
 	CARAWARE_FUZZ_FRAMES=100000000 $(CARGO) test $(CARGO_FLAGS) --test messages
 	CARAWARE_FUZZ_FRAMES=1000000 $(CARGO) test $(CARGO_FLAGS) --test fanout a_flood
 	cd viewer && CARAWARE_FUZZ_FRAMES=7000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
-	$(MIRI) -- --skip noise::
+	$(MAKE) --no-print-directory miri
 	export MIRIFLAGS="-Zmiri-disable-data-race-detector -Zmiri-many-seeds=0..64"; $(MIRI) --features racing-board -- a_board_that
 
-MIRI = cd sensor-daemon/tests/miri && RUSTFLAGS=-Ctarget-feature=+avx2 CARGO_TARGET_DIR=$(CURDIR)/target/miri cargo +nightly miri test
+miri: prerequisites ## the unsafe parts under Miri, in a few minutes (needs: rustup toolchain install nightly --component miri,rust-src)
+	$(MIRI) -- --skip noise::
 
 lint: lint-rust lint-python ## formatting and lints, as errors
 

@@ -15,6 +15,7 @@ mod overhead;
 mod page;
 mod peers;
 mod plots;
+mod quiet;
 mod record;
 mod report;
 mod scale;

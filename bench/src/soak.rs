@@ -4,7 +4,7 @@ use std::{
     collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
-    process::{Child, Command, Stdio},
+    process::Child,
     time::{Duration, Instant},
 };
 
@@ -13,7 +13,10 @@ use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
 use super::{BenchOptions, BenchReport, ReportTable, free_port, sides::BenchDirectory};
-use crate::target::{CountedMemory, Target, resources, signal};
+use crate::{
+    quiet::QuietPlace,
+    target::{CountedMemory, Target, resources, signal},
+};
 
 const NAME: &str = "soak";
 /// A run without end in short episodes, with messages between vehicles, at full speed.
@@ -198,7 +201,7 @@ impl Growth {
 /// The run that is watched, and its viewers. Dropping it ends them.
 struct SoakRun {
     caraware: PathBuf,
-    place: PathBuf,
+    place: QuietPlace,
     directory: PathBuf,
     child: Child,
     viewers: Vec<Child>,
@@ -226,17 +229,18 @@ impl SoakRun {
         let port = free_port()?;
         let fanout = format!("fanout.listen=tcp/127.0.0.1:{port}");
         let settings = SETTINGS.into_iter().chain([fanout.as_str()]);
-        let arguments = ["train", "town", "--name", NAME]
+        let arguments = ["train", "town", "--quiet", "--name", NAME]
             .into_iter()
             .chain(settings.flat_map(|setting| ["--set", setting]));
+        let quiet = QuietPlace::new(place);
         let start = |program: &Path, arguments: &[&str]| {
-            let child = command(program, place).args(arguments).spawn();
+            let child = quiet.command(program)?.args(arguments).spawn();
             child.map_err(|error| Exit::io("start", program, &error))
         };
         let mut run = Self {
             child: start(&caraware, &arguments.collect::<Vec<_>>())?,
             directory: place.join("runs").join(NAME),
-            place: place.to_owned(),
+            place: quiet.clone(),
             caraware,
             viewers: Vec::new(),
             handovers: 0,
@@ -267,7 +271,9 @@ impl SoakRun {
     fn check_alive(&mut self) -> Result<(), Exit> {
         match self.child.try_wait() {
             Ok(None) => Ok(()),
-            Ok(Some(status)) => Err(Exit::run(format!("the run ended by itself with {status}"), "")),
+            Ok(Some(status)) => Err(self
+                .place
+                .failure(&format!("the run ended by itself with {status}"), "")),
             Err(error) => Err(Exit::io("wait for", &self.caraware, &error)),
         }
     }
@@ -286,13 +292,15 @@ impl SoakRun {
     /// Replaces the trainer, after an update or at once in turn.
     fn hand_over(&mut self) -> Result<(), Exit> {
         let now = self.handovers % 2 == 1;
-        let status = command(&self.caraware, &self.place)
+        let status = self
+            .place
+            .command(&self.caraware)?
             .args(["handover", NAME])
             .args(now.then_some("--now"))
             .status();
         let status = status.map_err(|error| Exit::io("start", &self.caraware, &error))?;
         if !status.success() {
-            return Err(Exit::run(format!("the handover ended with {status}"), ""));
+            return Err(self.place.failure(&format!("the handover ended with {status}"), ""));
         }
         self.handovers += 1;
         Ok(())
@@ -300,7 +308,7 @@ impl SoakRun {
 
     /// Stops the run, and reads its report.
     fn stop(mut self) -> Result<Value, Exit> {
-        let stopped = command(&self.caraware, &self.place).args(["stop", NAME]).status();
+        let stopped = self.place.command(&self.caraware)?.args(["stop", NAME]).status();
         stopped.map_err(|error| Exit::io("start", &self.caraware, &error))?;
         let status = self.child.wait();
         status.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
@@ -308,18 +316,6 @@ impl SoakRun {
         let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         serde_json::from_str(&text).map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))
     }
-}
-
-/// A silent command whose runs and registry are in `place`.
-fn command(program: &Path, place: &Path) -> Command {
-    let mut command = Command::new(program);
-    command
-        .current_dir(place)
-        .env("CARAWARE_RUNTIME_DIR", place.join("r"))
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null());
-    command
 }
 
 /// Size of all files below a directory (MiB), without some of its entries.

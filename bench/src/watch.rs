@@ -12,7 +12,7 @@ use std::{
     collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
-    process::{Child, Command, Stdio},
+    process::{Child, Stdio},
     time::{Duration, Instant},
 };
 
@@ -21,7 +21,7 @@ use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal};
 
 use super::{BenchOptions, BenchReport, ReportTable, cores::BenchCores, sides::BenchDirectory};
-use crate::target::signal;
+use crate::{quiet::QuietPlace, target::signal};
 
 /// Names of the runs: the two that are compared, and the third.
 const NAMES: [&str; 3] = ["one", "other", "third"];
@@ -307,7 +307,7 @@ impl MedianInterval {
 /// The runs that are measured.
 struct LiveRuns {
     caraware: PathBuf,
-    place: PathBuf,
+    place: QuietPlace,
     runs: Vec<LiveRun>,
 }
 
@@ -331,7 +331,7 @@ impl LiveRuns {
         let sumocfg = city.write(&Install::find()?, &place.path().join("city"))?;
         let mut pair = Self {
             caraware: install::program(&options.bin, "caraware")?,
-            place: place.path().to_owned(),
+            place: QuietPlace::new(place.path()),
             runs: Vec::new(),
         };
         // What is started from here on is not on the cores of the loops.
@@ -365,7 +365,7 @@ impl LiveRuns {
         let ticks = [0, 1].map(|run: usize| self.runs[run].tick());
         for run in &mut self.runs {
             run.end_recorder()?;
-            let stopped = command(&self.caraware, &self.place).args(["stop", run.name]).status();
+            let stopped = self.place.command(&self.caraware)?.args(["stop", run.name]).status();
             stopped.map_err(|error| Exit::io("start", &self.caraware, &error))?;
             let status = run.child.wait();
             status.map_err(|error| Exit::io("wait for", &self.caraware, &error))?;
@@ -384,7 +384,7 @@ impl LiveRuns {
 struct LiveRun {
     name: &'static str,
     caraware: PathBuf,
-    place: PathBuf,
+    place: QuietPlace,
     child: Child,
     /// Boards of [`LOOP`].
     boards: Vec<BoardReader>,
@@ -416,13 +416,14 @@ impl Drop for LiveRun {
 
 impl LiveRun {
     /// Starts a run and waits for its first tick.
-    fn start(caraware: &Path, place: &Path, name: &'static str, sumocfg: &Path) -> Result<Self, Exit> {
+    fn start(caraware: &Path, place: &QuietPlace, name: &'static str, sumocfg: &Path) -> Result<Self, Exit> {
         let settings = [
             "fanout.enabled=false",
             "map.origin_latitude_deg=52.0",
             "map.origin_longitude_deg=10.0",
         ];
-        let child = command(caraware, place)
+        let child = place
+            .command(caraware)?
             .arg("simulate")
             .arg(sumocfg)
             .args(["--quiet", "--name", name])
@@ -432,7 +433,7 @@ impl LiveRun {
         let mut run = Self {
             name,
             caraware: caraware.to_owned(),
-            place: place.to_owned(),
+            place: place.clone(),
             child,
             boards: Vec::new(),
             stretch: None,
@@ -445,7 +446,7 @@ impl LiveRun {
             message_mb: 0.0,
             recorded_s: 0.0,
         };
-        let run_file = place.join("runs").join(name).join("run.json");
+        let run_file = place.directory().join("runs").join(name).join("run.json");
         while run.tick() == 0 {
             run.check_alive()?;
             if run.boards.is_empty()
@@ -472,8 +473,8 @@ impl LiveRun {
                 format!("a run made no tick in {DEADLINE:.0?}"),
                 "see its logs",
             )),
-            Ok(Some(status)) => Err(Exit::run(
-                format!("a run ended by itself with {status}"),
+            Ok(Some(status)) => Err(self.place.failure(
+                &format!("a run ended by itself with {status}"),
                 "its city lasts six simulated hours: give a smaller measurement to a faster machine",
             )),
             Err(error) => Err(Exit::io("wait for", &self.caraware, &error)),
@@ -531,12 +532,14 @@ impl LiveRun {
     }
 
     fn recording(&self) -> PathBuf {
-        self.place.join(format!("{}.mcap", self.name))
+        self.place.directory().join(format!("{}.mcap", self.name))
     }
 
     fn start_recorder(&mut self, watched: &str) -> Result<(), Exit> {
         self.end_recorder()?;
-        let recorder = command(&self.caraware, &self.place)
+        let recorder = self
+            .place
+            .command(&self.caraware)?
             .args(["record", watched, "--output"])
             .arg(self.recording())
             .stdout(Stdio::piped())
@@ -593,18 +596,6 @@ fn threads_cpu_s(pid: i32) -> f64 {
         text.split_whitespace().next()?.parse::<f64>().ok()
     });
     nanoseconds.sum::<f64>() * 1e-9
-}
-
-/// A silent command whose runs and registry are in `place`.
-fn command(program: &Path, place: &Path) -> Command {
-    let mut command = Command::new(program);
-    command
-        .current_dir(place)
-        .env("CARAWARE_RUNTIME_DIR", place.join("r"))
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null());
-    command
 }
 
 #[cfg(test)]
