@@ -13,6 +13,8 @@ pub enum Awaited {
     Input(Process),
     /// The credit of this process, a required consumer.
     Credit(Process),
+    /// The trainers of other ranks, in an operation of all.
+    Ranks,
     /// A command, the clock, or the end of the run.
     Other,
 }
@@ -22,6 +24,7 @@ impl Awaited {
     const INPUT: u32 = 1;
     const CREDIT: u32 = 2;
     const OTHER: u32 = 3;
+    const RANKS: u32 = 4;
 }
 
 /// What a process does at present. A process that waits in order looks for what it waits for every 50 ms, and notes each look: one
@@ -33,7 +36,7 @@ pub struct Activity {
     /// When it last finished a piece of work or looked for what it waits for, monotonic clock of the machine, nanoseconds; 0 before it
     /// has joined.
     pub noted_ns: u64,
-    /// 0 nothing, 1 input, 2 credit, 3 something else.
+    /// 0 nothing, 1 input, 2 credit, 3 something else, 4 the trainers of other ranks.
     pub(crate) awaited: u32,
     /// The process that it waits for, if it waits for input or credit.
     pub(crate) process: u32,
@@ -48,6 +51,7 @@ impl Activity {
             Awaited::Input(process) => (Awaited::INPUT, process as u32),
             Awaited::Credit(process) => (Awaited::CREDIT, process as u32),
             Awaited::Other => (Awaited::OTHER, 0),
+            Awaited::Ranks => (Awaited::RANKS, 0),
         };
         Self {
             noted_ns: clock::monotonic_ns(),
@@ -64,6 +68,7 @@ impl Activity {
             (Awaited::INPUT, Some(process)) => Awaited::Input(process),
             (Awaited::CREDIT, Some(process)) => Awaited::Credit(process),
             (Awaited::NOTHING, _) => Awaited::Nothing,
+            (Awaited::RANKS, _) => Awaited::Ranks,
             _ => Awaited::Other,
         }
     }
@@ -91,6 +96,7 @@ impl std::fmt::Display for Awaited {
             Self::Nothing => f.pad(""),
             Self::Input(process) => f.pad(process.name()),
             Self::Credit(process) => f.pad(&format!("{process} (credit)")),
+            Self::Ranks => f.pad("other ranks"),
             Self::Other => f.pad("–"),
         }
     }
@@ -105,7 +111,7 @@ mod tests {
         let waits = Process::ALL
             .into_iter()
             .flat_map(|process| [Awaited::Input(process), Awaited::Credit(process)]);
-        for awaited in waits.chain([Awaited::Nothing, Awaited::Other]) {
+        for awaited in waits.chain([Awaited::Nothing, Awaited::Other, Awaited::Ranks]) {
             assert_eq!(Activity::now(awaited).awaited(), awaited);
         }
     }

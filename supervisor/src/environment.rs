@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ipc_schema::{
+    activity::Awaited,
     board::State,
     episode_state,
     ports::{BoardReader, RosterWriter, Waker},
@@ -20,6 +21,9 @@ pub const SIMULATORS: [Process; 4] = [
     Process::SensorDaemon,
     Process::V2x,
 ];
+
+/// Age of a note below which the process that made it waits still: it notes every look.
+const FRESH_S: f64 = 1.0;
 
 /// The episode that a stored state belongs to.
 #[derive(Debug, Default, serde::Deserialize)]
@@ -173,6 +177,13 @@ impl Environment {
     /// Wakes `sensor-daemon`, which then reads the valid incarnation.
     pub fn wake_sensing(&self) {
         self.sensing.wake();
+    }
+
+    /// True while a process gives signs of life and waits for the trainers of other ranks.
+    #[must_use]
+    pub fn waits_for_ranks(&self, process: Process) -> bool {
+        let activity = self.board(process).activity();
+        activity.awaited() == Awaited::Ranks && activity.age_s() < FRESH_S
     }
 
     /// State of a process.

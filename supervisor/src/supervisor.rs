@@ -353,11 +353,7 @@ impl Supervisor {
             false => format!("{label} has made no progress for {:.0} s", silence.as_secs_f64()),
         };
         let run = self.processes.run();
-        // A trainer that waits for a hung one of another rank gives no sign of life either.
-        let may_replace = match row.on_exit {
-            OnExit::Replace => run.config.trainer.ranks == 1,
-            _ => row.on_exit(run) != OnExit::Required || self.may_simulate_again(row),
-        };
+        let may_replace = row.on_exit(run) != OnExit::Required || self.may_simulate_again(row);
         let is_killed = is_starting || may_replace && run.config.run.on_stall == StallAction::Replace;
         let end = if is_killed { "; it is killed" } else { "" };
         let note = format!("{what}: {state}{end}");
@@ -530,6 +526,8 @@ impl Supervisor {
         }
         match self.processes.first_not_ready() {
             None => self.ready_at = Some(self.last_check),
+            // The supervisors of the other ranks have deadlines of their own.
+            Some((row, environment)) if environment.waits_for_ranks(row.process) => {}
             Some((row, environment)) if started.elapsed().as_secs_f64() > environment.run.config.run.ready_s => {
                 let log = environment
                     .run

@@ -8,6 +8,7 @@ use std::{
 };
 
 use ipc_schema::{
+    activity::Awaited,
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
@@ -114,6 +115,65 @@ struct Attached {
     outside: bool,
 }
 
+/// The place in a run of a trainer that has no ports yet: it has a board, so that the supervisor knows that it lives.
+#[pyclass(frozen, module = "caraware._native")]
+struct Place {
+    /// `None` once an attachment has it.
+    membership: Mutex<Option<RunMembership>>,
+    run_json: String,
+}
+
+#[pymethods]
+impl Place {
+    /// Joins the run that `run_file` describes. No producer sends before an `Attachment` takes this place.
+    #[new]
+    fn new(run_file: &str) -> PyResult<Self> {
+        let (run, run_json) = read_run(run_file)?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let membership = RunMembership::join_with(run, Process::Trainer, 0, stop).map_err(membership_failed)?;
+        Ok(Self {
+            membership: Mutex::new(Some(membership)),
+            run_json,
+        })
+    }
+
+    /// Notes that this trainer lives, and waits for the trainers of other ranks.
+    fn note_waiting_for_ranks(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.note(Awaited::Ranks))
+    }
+
+    /// Notes that this trainer works.
+    fn note_working(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.note(Awaited::Nothing))
+    }
+}
+
+impl Place {
+    fn lock(&self) -> PyResult<MutexGuard<'_, Option<RunMembership>>> {
+        self.membership
+            .lock()
+            .map_err(|_| PyRuntimeError::new_err("an earlier call failed"))
+    }
+
+    fn note(&self, awaited: Awaited) -> PyResult<()> {
+        if let Some(membership) = &*self.lock()? {
+            membership.note(awaited);
+        }
+        Ok(())
+    }
+
+    fn take(&self) -> PyResult<RunMembership> {
+        let membership = self.lock()?.take();
+        membership.ok_or_else(|| PyRuntimeError::new_err("this place has been taken"))
+    }
+}
+
+/// The run file, read, and its text.
+fn read_run(run_file: &str) -> PyResult<(RunFile, String)> {
+    let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
+    Ok((run, std::fs::read_to_string(run_file)?))
+}
+
 /// The attachment of a trainer to a run. A process that the supervisor started has one; other processes may have any number.
 #[pyclass(frozen, module = "caraware._native")]
 struct Attachment {
@@ -128,11 +188,15 @@ impl Attachment {
     /// ticks before it are in the checkpoint from which this trainer continues.
     ///
     /// `outside` is for a process that the supervisor did not start. It does not end with the supervisor; `receive` raises instead.
+    ///
+    /// With `place` the trainer has joined the run before, and opens its ports there.
     #[new]
-    #[pyo3(signature = (run_file, first_tick=0, *, outside=false))]
-    fn new(run_file: &str, first_tick: u64, outside: bool) -> PyResult<Self> {
-        let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
-        let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
+    #[pyo3(signature = (run_file, first_tick=0, *, outside=false, place=None))]
+    fn new(run_file: &str, first_tick: u64, outside: bool, place: Option<&Place>) -> PyResult<Self> {
+        if let Some(place) = place {
+            return Self::attach(place.take()?, place.run_json.clone(), first_tick, outside);
+        }
+        let (run, run_json) = read_run(run_file)?;
         let stop = Arc::new(AtomicBool::new(false));
         let join = if outside {
             RunMembership::join_from_outside
@@ -291,6 +355,16 @@ impl Attachment {
         inner.membership.decided(lessons, since, stage);
         inner.traffic_bridge.wake();
         Ok(())
+    }
+
+    /// Notes that this trainer lives, and waits for the trainers of other ranks.
+    fn note_waiting_for_ranks(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.note(Awaited::Ranks))
+    }
+
+    /// Notes that this trainer works.
+    fn note_working(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.note(Awaited::Nothing))
     }
 
     /// Publishes that all work of this trainer is done.
@@ -554,6 +628,12 @@ impl Attachment {
         self.inner
             .lock()
             .map_err(|_| PyRuntimeError::new_err("an earlier call failed: attach again"))
+    }
+
+    /// Notes on the board what this trainer waits for.
+    fn note(&self, awaited: Awaited) -> PyResult<()> {
+        self.lock()?.membership.note(awaited);
+        Ok(())
     }
 
     fn wait(&self, timeout: Duration) -> PyResult<()> {
@@ -842,6 +922,7 @@ fn exchange(one: PathBuf, other: PathBuf) -> PyResult<()> {
 /// The module.
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Place>()?;
     module.add_class::<Attachment>()?;
     module.add_class::<ObservationBlock>()?;
     module.add_class::<Lease>()?;

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from caraware.run.checkpoint import POINTS
-from caraware.run.manifest import read_manifest
+from caraware.run.manifest import newest_update, read_manifest
 from caraware.run.program import caraware_program
 from safetensors.torch import load_file
 from synthetic import latest_checkpoint
@@ -189,6 +189,12 @@ def test_ranks_continue_from_the_newest_checkpoint_that_all_have(
     assert "no checkpoint here that all 2 ranks have" in said
 
 
+def has_begun(run: Path) -> bool:
+    """Whether the trainer of a run receives ticks."""
+    log = run / "logs" / "trainer.log"
+    return log.is_file() and "observations of" in log.read_text()
+
+
 DIES_AT_THE_END = """
 import os, signal, sys
 from caraware.learn.ranks import TorchRanks
@@ -237,8 +243,7 @@ def test_a_killed_trainer_comes_back_and_the_ranks_end_as_if_it_had_lived(
     two = two_ranks(tmp_path, registry, "two", *settings)
     runs = [tmp_path / name for name in names]
     # Before the first update, from which nothing could be continued.
-    log = runs[1] / "logs" / "trainer.log"
-    wait_until(lambda: log.is_file() and "observations of" in log.read_text(), two)
+    wait_until(lambda: has_begun(runs[1]), two)
     kill_trainer(runs[1], module, two)
     # Later rank 0, which had come back because of the other.
     wait_until(lambda: (runs[1] / "checkpoints" / "update-000002").exists(), two)
@@ -252,6 +257,81 @@ def test_a_killed_trainer_comes_back_and_the_ranks_end_as_if_it_had_lived(
     assert [report(run)["restarts"] for run in runs] == [2, 3]
     assert "all ranks had written their results before this trainer came" in logs[1]
     assert not [line for _, line in command_lines() if str(tmp_path) in line]
+
+
+HANGS_AT_THE_END = """
+import os, signal, sys
+from pathlib import Path
+from caraware.run.loop import TrainingLoop
+from caraware.train import main
+
+write_part = TrainingLoop._write_part
+def hang_before(loop):
+    run = Path(sys.argv[1]).parent
+    if run.name.endswith("-rank1") and not (run / "hung").exists():
+        (run / "hung").touch()
+        os.kill(os.getpid(), signal.SIGSTOP)
+    write_part(loop)
+TrainingLoop._write_part = hang_before
+sys.exit(main(sys.argv[1:]))
+"""
+"""A trainer that on rank 1 stops, once, when all is learnt and evaluated, before it writes its results."""
+STALL_S = 15
+"""Far longer than an update of these networks, and than any other piece of work, on a machine that is loaded."""
+
+
+def trainer_row(folder: Path, registry: Path, run: str) -> dict[str, Any]:
+    """What `caraware ps` says of the trainer of a live run."""
+    code, said = answer(ask(folder, registry, "ps", run, "--json"))
+    assert code == 0, said
+    rows = [row for measured in json.loads(said) for row in measured["processes"]]
+    return next((row for row in rows if row["process"] == "trainer"), {})
+
+
+def test_a_hung_trainer_alone_is_replaced(
+    tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_modules(tmp_path, monkeypatch, hangs_at_the_end=HANGS_AT_THE_END)
+    names, module = ("two", "two-rank1"), "hangs_at_the_end"
+    of_stalls = (f"run.stall_s={STALL_S}", "run.on_stall=replace", f"trainer.module={module}")
+    two = two_ranks(tmp_path, registry, "two", *EVERY_UPDATE, "run.real_time_factor=2", *of_stalls)
+    runs = [tmp_path / name for name in names]
+
+    def shown(rank: int, incarnation: int, column: str, text: str) -> bool:
+        row = trainer_row(tmp_path, registry, names[rank])
+        return (row.get("restarts"), row.get(column)) == (incarnation, text)
+
+    def is_waiting(incarnation: int) -> bool:
+        return shown(0, incarnation, "waits_for", "other ranks")
+
+    def stop_one_while_the_other_waits(incarnation: int) -> None:
+        """Stop this trainer of rank 1 after an update, and wait until that of rank 0 waits for it."""
+        wait_until(lambda: shown(1, incarnation, "state", "running"), two)
+        updates = newest_update(runs[1] / "checkpoints")
+        wait_until(lambda: newest_update(runs[1] / "checkpoints") > updates, two)
+        pid = trainer_of(runs[1], module)
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: is_waiting(incarnation), two)
+
+    wait_until(lambda: all(map(has_begun, runs)), two)
+    # In an operation of all ranks.
+    stop_one_while_the_other_waits(incarnation=0)
+    # In the meeting: the trainer of rank 0 is another one, and the hung one is still there.
+    stop_one_while_the_other_waits(incarnation=1)
+    kill_trainer(runs[0], module, two)
+    wait_until(lambda: is_waiting(2), two)
+    # Before the last operation of all, the exchange of results.
+    wait_until((runs[1] / "hung").exists, two)
+    wait_until(lambda: is_waiting(2), two)
+    said, _ = two.communicate(timeout=PATIENCE_S)
+    assert two.returncode == 0, said
+    assert_undisturbed(tmp_path, names, whole)
+    logs = [(run / "logs" / "trainer.log").read_text() for run in runs]
+    stopped = "a signal or a debugger has stopped it; it is killed"
+    assert [text.count(stopped) for text in logs] == [0, 3]
+    assert "has made no progress" not in logs[0]
+    assert [report(run)["restarts"] for run in runs] == [3, 3]
 
 
 def ask(folder: Path, registry: Path, *words: str) -> subprocess.Popen[str]:

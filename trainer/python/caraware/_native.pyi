@@ -39,6 +39,7 @@ __all__ = [
     "Lease",
     "Metric",
     "ObservationBlock",
+    "Place",
     "PointCloud",
     "RecordingFile",
     "SectionView",
@@ -92,6 +93,19 @@ TRUTH_COLUMNS: int
 """Columns of the section `truth`: x, y (m, world), yaw (rad), speed (m/s)."""
 
 @final
+class Place:
+    """The place in environment 0 of a run of a trainer that has no ports yet: it has a board. Any thread may note."""
+
+    def __new__(cls, run_file: str) -> Place:
+        """Join the run that `run_file` describes. No producer sends before an `Attachment` takes this place."""
+
+    def note_waiting_for_ranks(self) -> None:
+        """Note on the board that this trainer lives, and waits for the trainers of other ranks."""
+
+    def note_working(self) -> None:
+        """Note on the board that this trainer works."""
+
+@final
 class Attachment:
     """A trainer's place in one environment of a run, and its ports.
 
@@ -99,8 +113,12 @@ class Attachment:
     Methods may be called from any thread; `receive` and `wait_for_any` release the GIL while they wait.
     """
 
-    def __new__(cls, run_file: str, first_tick: int = 0, *, outside: bool = False) -> Attachment:
+    def __new__(
+        cls, run_file: str, first_tick: int = 0, *, outside: bool = False, place: Place | None = None
+    ) -> Attachment:
         """Join the run that `run_file` describes. Producers send from `first_tick` on: all before are committed.
+
+        With `place` the trainer has joined the run before. Raises RuntimeError where another attachment has it.
 
         With `outside`, the supervisor did not start this process. It then does not end with the supervisor; `receive`
         raises RuntimeError instead.
@@ -180,6 +198,12 @@ class Attachment:
 
         `traffic-bridge` waits for this before each lesson of a curriculum.
         """
+
+    def note_waiting_for_ranks(self) -> None:
+        """Note on the board that this trainer lives, and waits for the trainers of other ranks."""
+
+    def note_working(self) -> None:
+        """Note on the board that this trainer works."""
 
     def done(self) -> None:
         """Publish that all work is done."""

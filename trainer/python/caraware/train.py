@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, read_run, run_process
 
 if TYPE_CHECKING:
+    from caraware.ipc.channel import Channel
     from caraware.learn.meeting import Meeting
     from caraware.learn.ranks import Ranks
     from caraware.run.config import RunConfig
@@ -30,16 +31,21 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
 
     config = RunConfig.from_run(read_run(run_file))
 
+    from caraware import _native
     from caraware.ipc.channel import Channel
     from caraware.learn import ranks
+    from caraware.learn.waiting import WaitNotes
     from caraware.run.checkpoint import remove_newer
 
     if role.gets_ready and not _get_ready(run_file, config, role):
         return
+    # Before the meeting: the supervisor must know that a trainer that waits there lives.
+    place = _native.Place(str(run_file)) if config.trainer.ranks > 1 else None
+    notes = WaitNotes(place)
     meeting = _meeting(config, role, stop) if config.trainer.ranks > 1 else None
-    together = ranks.of_run(config.trainer.ranks, meeting)
+    together = ranks.of_run(config.trainer.ranks, meeting, notes)
     if meeting is not None and meeting.is_over:
-        _receive_the_rest(run_file, config, stop)
+        _receive_the_rest(Channel(str(run_file), place=place), config, stop)
         return
     if meeting is not None and meeting.continues():
         # An update counts when all ranks have committed it.
@@ -49,7 +55,9 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     if learner is not None:
         positions = enumerate(position.committed() for position in learner.positions())
         config.commits.begin(learner.shape().learner, dict(positions))
-    channel = Channel(str(run_file), first_ticks[0])
+    channel = Channel(str(run_file), first_ticks[0], place=place)
+    if place is not None:
+        notes.board = channel
     loop = TrainingLoop(
         channel,
         config,
@@ -78,12 +86,11 @@ def _meeting(config: "RunConfig", role: HandoverRole, stop: StopSignal) -> "Meet
     return Meeting(Attendance(role.incarnation, role.handovers, names), lambda: stop.requested)
 
 
-def _receive_the_rest(run_file: Path, config: "RunConfig", stop: StopSignal) -> None:
+def _receive_the_rest(channel: "Channel", config: "RunConfig", stop: StopSignal) -> None:
     """Receive what is left of the run after all ranks have written their results."""
-    from caraware.ipc.channel import Channel, StreamEndedError
+    from caraware.ipc.channel import StreamEndedError
 
     log.info("all ranks had written their results before this trainer came")
-    channel = Channel(str(run_file))
     waiting = [channel, *(channel.in_environment(index) for index in range(1, len(config.environments)))]
     while waiting and not stop.requested:
         for environment in list(waiting):

@@ -371,12 +371,19 @@ class Channel:
     """
 
     def __init__(
-        self, run_file: str, first_tick: int | None = None, *, learner: str | None = None, outside: bool = False
+        self,
+        run_file: str,
+        first_tick: int | None = None,
+        *,
+        learner: str | None = None,
+        outside: bool = False,
+        place: _native.Place | None = None,
     ) -> None:
         """Join the run; ticks come from the one after the last commit of any learner on, whichever it was.
 
         `learner` is the name under which this one commits; without, that of its module. A learner whose checkpoint is
         older than its last commit gives the `first_tick` to begin with: later ones are not learnt, and come again.
+        With a `place` this process has joined before.
 
         Raises `CommitLogError`, and `RuntimeError` where the tick is not in the journal any more.
         """
@@ -384,7 +391,7 @@ class Channel:
         self.learner = learner or str(setting(run, "trainer.module", str))
         self._commits = CommitLog(run)
         begin = self._begin(0, first_tick)
-        self._hold(_native.Attachment(run_file, begin, outside=outside))
+        self._hold(_native.Attachment(run_file, begin, outside=outside, place=place))
 
     def _begin(self, environment: int, first_tick: int | None) -> int:
         """Where this environment begins; what has been committed beyond that is not learnt any more."""
@@ -579,6 +586,14 @@ class Channel:
     def actor_lag_ticks(self) -> int:
         """Ticks that the process that waits for actions has finished beyond the newest one consumed."""
         return self._attachment.actor_lag_ticks()
+
+    def note_waiting_for_ranks(self) -> None:
+        """Note that this trainer lives, and waits for those of other ranks. Any thread may; not the one that waits."""
+        self._attachment.note_waiting_for_ranks()
+
+    def note_working(self) -> None:
+        """Note that this trainer works."""
+        self._attachment.note_working()
 
     def done(self) -> None:
         """All work is done: the process may end."""

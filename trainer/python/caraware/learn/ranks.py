@@ -26,6 +26,7 @@ from torch import Tensor
 
 from caraware.learn.gpu import has_usable_gpu
 from caraware.learn.meeting import Meeting, MeetingError
+from caraware.learn.waiting import WaitNotes
 
 log = logging.getLogger("caraware.train")
 
@@ -174,14 +175,15 @@ def shared_secret(environment: Mapping[str, str]) -> bytes:
 class TorchRanks(Ranks):
     """A trainer among others that `torchrun` started (`caraware.parallel`)."""
 
-    def __init__(self, ranks: int, meeting: Meeting | None = None) -> None:
+    def __init__(self, ranks: int, meeting: Meeting | None = None, notes: WaitNotes | None = None) -> None:
         """Join the others. Raises `RankError` if they do not come, or are not `ranks`.
 
-        With a `meeting`, at which all have gathered, trainers that come later may form further groups.
+        With a `meeting`, at which all have gathered, trainers that come later may form further groups. `notes` are
+        made while this trainer waits for others.
         """
         import torch.distributed as dist
 
-        self._dist, self._meeting = dist, meeting
+        self._dist, self._meeting, self._notes = dist, meeting, notes or WaitNotes()
         if (started := int(os.environ.get("WORLD_SIZE", "0"))) != ranks:
             raise RankError(f"`trainer.ranks` is {ranks}, and torchrun started {started} processes")
         self._is_shared = False
@@ -217,14 +219,15 @@ class TorchRanks(Ranks):
     @contextmanager
     def _together(self, doing: str) -> Iterator[None]:
         """What torch says of a lost connection names addresses, not what happened."""
-        try:
-            yield
-        except (MeetingError, RuntimeError, ValueError) as error:
-            lost = f"another rank has ended or cannot be reached ({doing}: {str(error).splitlines()[0]})"
-            if self._meeting is not None:
-                log.warning("%s; waiting for its successor", lost)
-                self._meeting.await_successor()
-            raise RankError(lost) from error
+        with self._notes.waiting():
+            try:
+                yield
+            except (MeetingError, RuntimeError, ValueError) as error:
+                lost = f"another rank has ended or cannot be reached ({doing}: {str(error).splitlines()[0]})"
+                if self._meeting is not None:
+                    log.warning("%s; waiting for its successor", lost)
+                    self._meeting.await_successor()
+                raise RankError(lost) from error
 
     def agree(self, verdict: Verdict, episode: int) -> tuple[Verdict, int]:
         """See `Ranks.agree`."""
@@ -315,18 +318,20 @@ class TorchRanks(Ranks):
         self._dist.destroy_process_group()
 
 
-def of_run(ranks: int, meeting: Meeting | None = None) -> Ranks:
+def of_run(ranks: int, meeting: Meeting | None = None, notes: WaitNotes | None = None) -> Ranks:
     """Alone, or among the others that `torchrun` started. Raises `RankError`.
 
-    With a `meeting`, waits until all have gathered there.
+    With a `meeting`, waits until all have gathered there. `notes` are made while this trainer waits for others.
     """
     if ranks == 1:
         return Ranks()
+    notes = notes or WaitNotes()
     if meeting is not None:
         try:
-            meeting.gather()
+            with notes.waiting():
+                meeting.gather()
         except MeetingError as error:
             raise RankError(str(error)) from error
         if meeting.is_over:
             return Ranks()
-    return TorchRanks(ranks, meeting)
+    return TorchRanks(ranks, meeting, notes)
