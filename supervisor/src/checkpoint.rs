@@ -232,7 +232,13 @@ impl FoundCheckpoint {
     }
 }
 
-/// The directory of the run `named`, a name in `runs` or a directory, if it has no checkpoint yet: it was cut off before its first one.
+/// Environment variable: the newest checkpoint that all ranks of a launch have, `caraware.run.manifest.NEWEST`.
+const NEWEST: &str = "CARAWARE_NEWEST_CHECKPOINT";
+/// Its value where they have none in common, `caraware.run.manifest.BEGINNING`.
+const BEGINNING: &str = "beginning";
+
+/// The directory of the run `named`, a name in `runs` or a directory, if it has no checkpoint that counts: it was cut off before its
+/// first one, or before another rank had written that.
 ///
 /// # Errors
 /// The run was cut off before it was prepared.
@@ -252,7 +258,8 @@ pub fn without_checkpoint(named: &str, runs: &Path) -> Result<Option<PathBuf>, E
         .into_iter()
         .flatten()
         .flatten();
-    if entries.any(is_checkpoint) {
+    let begins_again = std::env::var_os(NEWEST).is_some_and(|newest| newest == BEGINNING);
+    if !begins_again && entries.any(is_checkpoint) {
         return Ok(None);
     }
     if !run_dir.join("run.json").is_file() {

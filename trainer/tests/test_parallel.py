@@ -187,12 +187,48 @@ def test_ranks_continue_from_the_newest_checkpoint_that_all_have(
     code, said = resume(tmp_path, registry, "whole")
     assert code != 0
     assert "no checkpoint here that all 2 ranks have" in said
+    shutil.rmtree(tmp_path / "whole-rank1")
+    code, said = resume(tmp_path, registry, "whole")
+    assert code != 0
+    assert "each rank needs its run, on its machine; rank 1 has none" in said
 
 
 def has_begun(run: Path) -> bool:
     """Whether the trainer of a run receives ticks."""
     log = run / "logs" / "trainer.log"
     return log.is_file() and "observations of" in log.read_text()
+
+
+def supervisor_of(run: Path) -> int:
+    return int(json.loads((run / "run.json").read_text())["supervisor_pid"])
+
+
+def test_ranks_that_were_killed_before_their_first_common_checkpoint_continue_from_their_beginning(
+    tmp_path: Path, registry: Path, whole: WholeRun
+) -> None:
+    names = ("cut", "cut-rank1")
+    cut = two_ranks(tmp_path, registry, "cut", *EVERY_UPDATE, "run.real_time_factor=2")
+    runs = [tmp_path / name for name in names]
+    wait_until(lambda: all(map(has_begun, runs)), cut)
+    # As by a loss of power: a trainer whose supervisor dies alone writes a checkpoint.
+    for run in runs:
+        os.kill(supervisor_of(run), signal.SIGSTOP)
+    for run in runs:
+        kill_trainer(run, "caraware.train", cut)
+        os.kill(supervisor_of(run), signal.SIGKILL)
+    said, _ = cut.communicate(timeout=PATIENCE_S)
+    assert cut.returncode != 0, said
+    assert not [checkpoint for run in runs for checkpoint in run.glob("checkpoints/update-*")]
+    # The same state as after a kill when only rank 0 had its first checkpoint.
+    first = "checkpoints/update-000001"
+    shutil.copytree(whole.folder / "whole" / first, runs[0] / first)
+    code, said = resume(tmp_path, registry, "cut", "--name=other")
+    assert code != 0 and "no checkpoint that all ranks have, with which another run could begin" in said, said
+    code, said = resume(tmp_path, registry, "cut", "--set=run.real_time_factor=0")
+    assert code == 0, said
+    assert [report(run)["beginning"] for run in runs] == [None, None]
+    assert_undisturbed(tmp_path, names, whole)
+    assert "update-000001 was not written by all ranks" in (runs[0] / "logs" / "trainer.log").read_text()
 
 
 DIES_AT_THE_END = """

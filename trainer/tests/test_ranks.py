@@ -14,7 +14,7 @@ import torch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import ConfigError, TrainerConfig
 from caraware.learn.ranks import SECRET, RankError, Ranks, SampleUnion, shared_secret
-from caraware.parallel import RankPlace, command
+from caraware.parallel import RankCheckpoints, RankPlace, command
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
@@ -221,7 +221,7 @@ def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> Non
         assert torch.equal(first.own[0], first.mine(together.advantage))
 
 
-def disagree(place: RankPlace, own: list[str]) -> list[set[str]]:
+def disagree(place: RankPlace, own: RankCheckpoints) -> list[RankCheckpoints]:
     raise AssertionError("there is nothing to agree on")
 
 

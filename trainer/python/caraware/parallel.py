@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-from caraware.run.manifest import NEWEST, sound_checkpoints
+from caraware.run.manifest import BEGINNING, NEWEST, sound_checkpoints
 from caraware.run.program import ProgramError, caraware_program, end_with_parent
 
 WAIT_AT_MOST = timedelta(minutes=5)
@@ -52,7 +52,9 @@ class RankPlace:
         return f"{name}-rank{self.rank}" if self.rank > 0 else name
 
 
-Agree = Callable[[RankPlace, list[str]], list[set[str]]]
+RankCheckpoints = list[str] | None
+"""Names of a rank's sound checkpoints; None where it has no run."""
+Agree = Callable[[RankPlace, RankCheckpoints], list[RankCheckpoints]]
 """Sends the names of this rank's checkpoints to the others; returns those of all ranks."""
 
 
@@ -84,22 +86,32 @@ def _resume(named: Path, runs: Path, name: str | None, place: RankPlace, launch:
     is_checkpoint = named.parent.name == "checkpoints"
     run = named.parents[1] if is_checkpoint else next((at for at in (runs / named, named) if at.is_dir()), runs / named)
     own = run.with_name(place.named(run.name))
-    folder = own / "checkpoints"
-    newest = named.name if is_checkpoint else _newest_of_all(folder, place, agree)
+    newest = named.name if is_checkpoint else _newest_of_all(own, place, agree)
     if is_checkpoint or name is not None:
-        return ["--resume", str(folder / newest), "--name", place.named(name or f"{run.name}-p{launch}")]
+        if newest == BEGINNING:
+            raise ResumeError(f"{own}: no checkpoint that all ranks have, with which another run could begin")
+        return ["--resume", str(own / "checkpoints" / newest), "--name", place.named(name or f"{run.name}-p{launch}")]
     os.environ[NEWEST] = newest
     return ["--resume", str(own)]
 
 
-def _newest_of_all(folder: Path, place: RankPlace, agree: Agree) -> str:
-    common = set.intersection(*agree(place, [checkpoint.name for checkpoint in sound_checkpoints(folder)]))
-    if not common:
-        raise ResumeError(f"{folder}: no checkpoint here that all {place.ranks} ranks have, each on its machine")
-    return max(common)
+def _newest_of_all(own: Path, place: RankPlace, agree: Agree) -> str:
+    """The newest checkpoint of all ranks, or `BEGINNING`. Raises `ResumeError`."""
+    names = [checkpoint.name for checkpoint in sound_checkpoints(own / "checkpoints")]
+    of_all = agree(place, names if (own / "run.json").is_file() else None)
+    made = [names for names in of_all if names is not None]
+    if len(made) < len(of_all):
+        missing = ", ".join(str(rank) for rank, names in enumerate(of_all) if names is None)
+        raise ResumeError(f"{own}: each rank needs its run, on its machine; rank {missing} has none")
+    if common := set.intersection(*map(set, made)):
+        return max(common)
+    # Ranks write every checkpoint together: one that dies before its first leaves the others with one at most.
+    if any(len(names) > 1 for names in made):
+        raise ResumeError(f"{own}: no checkpoint here that all {place.ranks} ranks have, each on its machine")
+    return BEGINNING
 
 
-def exchange_checkpoints(place: RankPlace, own: list[str]) -> list[set[str]]:
+def exchange_checkpoints(place: RankPlace, own: RankCheckpoints) -> list[RankCheckpoints]:
     """The names of every rank's checkpoints, exchanged by the store that `torchrun` keeps for its processes."""
     from torch.distributed import TCPStore  # type: ignore[attr-defined]  # torch lists it without exporting it
 
@@ -107,7 +119,7 @@ def exchange_checkpoints(place: RankPlace, own: list[str]) -> list[set[str]]:
     attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
     store = TCPStore(address, port, is_master=False, timeout=WAIT_AT_MOST)
     store.set(f"caraware/{attempt}/checkpoints/{place.rank}", json.dumps(own))
-    return [set(json.loads(store.get(f"caraware/{attempt}/checkpoints/{rank}"))) for rank in range(place.ranks)]
+    return [json.loads(store.get(f"caraware/{attempt}/checkpoints/{rank}")) for rank in range(place.ranks)]
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -35,7 +35,6 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     from caraware.ipc.channel import Channel
     from caraware.learn import ranks
     from caraware.learn.waiting import WaitNotes
-    from caraware.run.checkpoint import remove_newer
 
     if role.gets_ready and not _get_ready(run_file, config, role):
         return
@@ -47,9 +46,8 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     if meeting is not None and meeting.is_over:
         _receive_the_rest(Channel(str(run_file), place=place), config, stop)
         return
-    if meeting is not None and meeting.continues():
-        # An update counts when all ranks have committed it.
-        remove_newer(config.run_dir / "checkpoints", meeting.common_checkpoint())
+    if meeting is not None:
+        _forget_uncommon(config.run_dir / "checkpoints", meeting)
     learner = _successor(run_file, config, role, together) if role.replaces else _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     if learner is not None:
@@ -84,6 +82,18 @@ def _meeting(config: "RunConfig", role: HandoverRole, stop: StopSignal) -> "Meet
 
     names = tuple(checkpoint.name for checkpoint in sound_checkpoints(config.run_dir / "checkpoints"))
     return Meeting(Attendance(role.incarnation, role.handovers, names), lambda: stop.requested)
+
+
+def _forget_uncommon(folder: Path, meeting: "Meeting") -> None:
+    """Remove checkpoints that only some ranks have: an update counts when all ranks have committed it."""
+    from caraware.run.checkpoint import remove_newer
+    from caraware.run.manifest import BEGINNING, NEWEST
+
+    if meeting.continues():
+        remove_newer(folder, meeting.common_checkpoint())
+    elif newest := os.environ.get(NEWEST):
+        # The first trainers of runs that were resumed.
+        remove_newer(folder, None if newest == BEGINNING else newest)
 
 
 def _receive_the_rest(channel: "Channel", config: "RunConfig", stop: StopSignal) -> None:

@@ -29,6 +29,8 @@ LATEST, BEST = "latest", "best"
 """Files beside the checkpoints that name the newest, and the one whose evaluation had the least mean error."""
 NEWEST = "CARAWARE_NEWEST_CHECKPOINT"
 """Environment variable: name of the newest checkpoint of a run that counts. Ranks continue from one that all have."""
+BEGINNING = "beginning"
+"""Its value where ranks have none in common: they begin again, and none of their checkpoints counts."""
 OWN_HASH = "manifest_sha256"
 """Entry of the manifest: SHA-256 of all its other entries, as canonical JSON."""
 
@@ -192,7 +194,8 @@ def _choose(folder: Path, which: str) -> Path:
         except CheckpointError as error:
             log.warning("checkpoint refused, the newest is used: %s", error)
     limit = os.environ.get(NEWEST)
-    newest = next((each for each in sound_checkpoints(folder) if limit is None or each.name <= limit), None)
+    counting = (each for each in sound_checkpoints(folder) if limit is None or each.name <= limit)
+    newest = None if limit == BEGINNING else next(counting, None)
     if newest is None:
         raise CheckpointError(folder, "holds no checkpoint that can be used")
     return newest
