@@ -71,15 +71,17 @@ def launch(folder: Path, registry: Path, words: list[str]) -> subprocess.Popen[s
     )
 
 
-TWO_RANKS = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "caraware.parallel"]
+def torchrun(*options: str) -> list[str]:
+    options = ("--standalone", "--nproc-per-node=2", *options)
+    return [sys.executable, "-m", "torch.distributed.run", *options, "-m", "caraware.parallel"]
 
 
 def two_ranks(folder: Path, registry: Path, name: str = "two", *more: str) -> subprocess.Popen[str]:
-    return start(folder, registry, [sys.executable, *TWO_RANKS, f"--name={name}"], 256, *more)
+    return start(folder, registry, [*torchrun(), f"--name={name}"], 256, *more)
 
 
 def resume(folder: Path, registry: Path, named: str, *more: str) -> tuple[int, str]:
-    process = launch(folder, registry, [sys.executable, *TWO_RANKS, f"--resume={named}", *more])
+    process = launch(folder, registry, [*torchrun(), f"--resume={named}", *more])
     said, _ = process.communicate(timeout=PATIENCE_S)
     return process.returncode, said
 
@@ -229,6 +231,83 @@ def test_ranks_that_were_killed_before_their_first_common_checkpoint_continue_fr
     assert [report(run)["beginning"] for run in runs] == [None, None]
     assert_undisturbed(tmp_path, names, whole)
     assert "update-000001 was not written by all ranks" in (runs[0] / "logs" / "trainer.log").read_text()
+
+
+KILLS_ITS_SUPERVISOR = """
+import os, signal, sys, time
+from pathlib import Path
+from caraware.learn.ranks import TorchRanks
+from caraware.train import main
+
+run = Path(sys.argv[1]).parent
+note_end = TorchRanks.note_end
+def note_end_and_kill(ranks):
+    note_end(ranks)
+    killed = run / "killed"
+    if ranks.rank == 0 and not killed.exists():
+        killed.touch()
+        while not (run.with_name(run.name + "-rank1") / "report.json").exists():
+            time.sleep(0.01)
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(3600)
+TorchRanks.note_end = note_end_and_kill
+sys.exit(main(sys.argv[1:]))
+"""
+"""A trainer that on rank 0 kills its supervisor, once, when rank 1 has completed its run, and then does not end."""
+
+
+def memory_of(run: Path) -> str:
+    """How the names of a run's files in shared memory begin."""
+    return str(json.loads((run / "run.json").read_text())["shared_memory"]["prefix"])
+
+
+def test_a_launch_whose_supervisors_are_killed_continues_by_itself(
+    tmp_path: Path, registry: Path, whole: WholeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_modules(tmp_path, monkeypatch, kills_its_supervisor=KILLS_ITS_SUPERVISOR)
+    names, settings = ("two", "two-rank1"), (*EVERY_UPDATE, "run.real_time_factor=5")
+    words = [*torchrun("--max-restarts=3"), "--name=two"]
+    two = start(tmp_path, registry, words, 256, *settings, "trainer.module=kills_its_supervisor")
+    runs, memory = [tmp_path / name for name in names], set()
+    # Before the first checkpoint, in the middle, and when the other rank has completed its run.
+    wait_until(lambda: all(map(has_begun, runs)), two)
+    assert not [checkpoint for run in runs for checkpoint in run.glob("checkpoints/update-*")]
+    memory |= set(map(memory_of, runs))
+    os.kill(supervisor_of(runs[1]), signal.SIGKILL)
+    wait_until(lambda: (runs[0] / "checkpoints" / "update-000002").exists(), two)
+    memory |= set(map(memory_of, runs))
+    os.kill(supervisor_of(runs[0]), signal.SIGKILL)
+    wait_until((runs[0] / "killed").exists, two)
+    memory |= set(map(memory_of, runs))
+    said, _ = two.communicate(timeout=PATIENCE_S)
+    assert two.returncode == 0, said
+    assert_undisturbed(tmp_path, names, whole)
+    memory |= set(map(memory_of, runs))
+    assert len(memory) == 8
+    assert not [file for prefix in memory for file in Path("/dev/shm").glob(f"{prefix}*")]
+    assert not [line for _, line in command_lines() if str(tmp_path) in line]
+
+
+def test_a_launch_that_began_at_a_checkpoint_continues_its_own_runs(
+    tmp_path: Path, registry: Path, whole: WholeRun
+) -> None:
+    whole.copy_to(tmp_path)
+    older, names = tmp_path / "whole" / "checkpoints" / "update-000001", ("other", "other-rank1")
+    words = [*torchrun("--max-restarts=1"), f"--resume={older}", "--name=other", "--set=run.real_time_factor=5"]
+    other = launch(tmp_path, registry, words)
+    runs = [tmp_path / name for name in names]
+    wait_until(lambda: (runs[1] / "checkpoints" / "update-000003").exists(), other)
+    os.kill(supervisor_of(runs[0]), signal.SIGKILL)
+    said, _ = other.communicate(timeout=PATIENCE_S)
+    assert other.returncode == 0, said
+    assert [tensors(run) for run in runs] == [tensors(whole.folder / name) for name in ("whole", "whole-rank1")]
+    written = report(runs[0])
+    assert int(Path(written["beginning"]["checkpoint"]).name.removeprefix("update-")) >= 2
+    # A name that an earlier launch has used is refused again, however often `torchrun` tries.
+    again = start(tmp_path, registry, [*torchrun("--max-restarts=1"), "--name=other"], 256)
+    said, _ = again.communicate(timeout=PATIENCE_S)
+    assert again.returncode != 0 and "is in use" in said, said
+    assert report(runs[0]) == written
 
 
 DIES_AT_THE_END = """

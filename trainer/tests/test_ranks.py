@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,11 @@ import torch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import ConfigError, TrainerConfig
 from caraware.learn.ranks import SECRET, RankError, Ranks, SampleUnion, shared_secret
-from caraware.parallel import RankCheckpoints, RankPlace, command
+from caraware.parallel import Agree, Completed, Launch, RankPlace, RankRun, ResumeError, command
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
-from caraware.run.manifest import read_manifest
+from caraware.run.manifest import BEGINNING, NEWEST, read_manifest
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
 from safetensors.torch import load_file
 from synthetic import FIELDS, latest_checkpoint, run_file
@@ -221,18 +222,76 @@ def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> Non
         assert torch.equal(first.own[0], first.mine(together.advantage))
 
 
-def disagree(place: RankPlace, own: RankCheckpoints) -> list[RankCheckpoints]:
+def disagree(place: RankPlace, name: str, own: RankRun) -> list[RankRun]:
     raise AssertionError("there is nothing to agree on")
+
+
+def beside(other: RankRun) -> Agree:
+    """What this rank and another have of their runs."""
+    return lambda place, name, own: [own, other]
+
+
+MADE, COMPLETED = RankRun(True, False, ()), RankRun(True, True, ("update-000002",))
+AHEAD = RankRun(True, False, ("update-000001", "update-000002"))
+FIRST = RankPlace(0, 2, 0, 2)
+
+
+def test_a_launch_that_is_started_again_continues_the_runs_that_it_has_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(NEWEST, "")
+    monkeypatch.delenv(NEWEST)
+    words = ["town", "--runs", str(tmp_path), "--name", "x", "--set", "traffic.cavs=8", "--viewer=web", "--user", "u"]
+    run, again = tmp_path / "x", Launch(7, time.time() - 60, restarts=1)
+    # What a supervisor that died in its preparation has left is removed; other directories stay.
+    run.mkdir()
+    (run / ".preparing-999999999").touch()
+    (tmp_path / "y").mkdir()
+    (tmp_path / "y" / "file").touch()
+    assert command(words, FIRST, again, beside(MADE)) == command(words, FIRST, Launch(7, 0.0), disagree)
+    assert [path.name for path in tmp_path.iterdir()] == ["y"]
+    command([*words, "--name", "y"], FIRST, again, beside(MADE))
+    assert (tmp_path / "y" / "file").exists()
+
+    run.mkdir()
+    (run / "run.json").write_text("{}")
+    continued = ["train", "--viewer=web", "--user", "u", "--resume", str(run)]
+    assert command(words, FIRST, again, beside(RankRun(False, False, ()))) == continued
+    assert NEWEST not in os.environ
+    assert command(words, FIRST, again, beside(MADE)) == continued
+    assert os.environ[NEWEST] == BEGINNING
+    with pytest.raises(ResumeError, match="no checkpoint here that all 2 ranks have"):
+        command(words, FIRST, again, beside(AHEAD))
+    # Another launch has made it, before this one began.
+    os.utime(run / "run.json", (0, 0))
+    assert "--name" in command(words, FIRST, again, beside(MADE))
+
+
+def test_ranks_that_have_all_completed_their_runs_do_not_continue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(NEWEST, "")
+    monkeypatch.delenv(NEWEST)
+    run, again = tmp_path / "x", Launch(7, time.time() - 60, restarts=1)
+    run.mkdir()
+    (run / "run.json").write_text("{}")
+    (run / "report.json").write_text(json.dumps({"result": "completed"}))
+    for words in (["--name", "x", "--runs", str(tmp_path)], ["--resume", "x", "--runs", str(tmp_path)]):
+        with pytest.raises(Completed):
+            command(words, FIRST, again, beside(COMPLETED))
+        assert "--resume" in command(words, FIRST, again, beside(MADE))
+    with pytest.raises(ResumeError, match="ranks on several machines do not continue by themselves"):
+        command([], FIRST, Launch(7, 0.0, restarts=1, machines=2), disagree)
 
 
 def test_each_rank_gets_its_own_environments_and_cores() -> None:
     place = RankPlace(rank=1, ranks=2, local_rank=1, local_ranks=2)
-    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7, disagree)
+    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, Launch(7, 0.0), disagree)
     assert words[:4] == ["train", "town", "--set", "traffic.cavs=8"]
     assert words[words.index("--name") + 1] == "x-rank1"
     for setting in ("run.envs=3", "run.first_env=3", "trainer.ranks=2", "fanout.enabled=false"):
         assert f"--set={setting}" in words
-    first = command([], RankPlace(0, 2, 0, 2), 7, disagree)
+    first = command([], RankPlace(0, 2, 0, 2), Launch(7, 0.0), disagree)
     assert first[first.index("--name") + 1] == "town-p7"
     assert not any("fanout" in word for word in first)
     assert place.cores([0, 1, 2, 3, 8]) == [2, 3]
