@@ -11,6 +11,7 @@ use std::{
 };
 
 use ipc_schema::{header::MessageHeader, storage};
+use memmap2::MmapMut;
 
 /// Longest chunk, bytes, unless one message is longer: short enough to free often, long enough to allocate seldom.
 const CHUNK_BYTES: usize = 4 << 20;
@@ -18,8 +19,8 @@ const CHUNK_BYTES: usize = 4 << 20;
 const CHUNKS: usize = 8;
 /// Bytes held in memory before the file is used.
 const MEMORY_BYTES: usize = 64 << 20;
-/// Most free chunks that stay in memory: as many as a commit usually frees. What a slow learner needed beyond goes back to the system.
-const FREE_IN_MEMORY: usize = 4;
+/// Most free chunks that stay in memory. What a slow learner or a handover needed beyond goes back to the system.
+const FREE_IN_MEMORY: usize = 2;
 
 /// The journal cannot store or deliver a tick.
 #[derive(Debug, thiserror::Error)]
@@ -27,7 +28,7 @@ pub enum JournalError {
     /// The file cannot be created, written or read.
     #[error("cannot {action} the journal of observations in {directory}")]
     Io {
-        /// "create", "write", "read".
+        /// "create", "write", "read", "get memory for".
         action: &'static str,
         /// Where it is.
         directory: PathBuf,
@@ -62,7 +63,8 @@ pub enum JournalError {
 /// Where a chunk's bytes lie.
 #[derive(Debug)]
 enum ChunkStorage {
-    Memory(Vec<u8>),
+    /// Pages of its own: glibc keeps freed blocks of this size in its heap, once it has seen one.
+    Memory(MmapMut),
     /// Number of the chunk in the file.
     File(u64),
 }
@@ -195,10 +197,7 @@ impl Journal {
         };
         let offset = chunk.used;
         match &mut chunk.place {
-            ChunkStorage::Memory(bytes) => {
-                bytes.truncate(offset);
-                bytes.extend_from_slice(payload);
-            }
+            ChunkStorage::Memory(bytes) => bytes[offset..offset + payload.len()].copy_from_slice(payload),
             ChunkStorage::File(number) => {
                 let at = *number * self.chunk_bytes as u64 + offset as u64;
                 let file = self.file.as_ref();
@@ -311,8 +310,9 @@ impl Journal {
 
     fn new_place(&mut self) -> Result<ChunkStorage, JournalError> {
         if (self.memory_chunks + 1) * self.chunk_bytes <= MEMORY_BYTES || self.memory_chunks < 2 {
+            let bytes = MmapMut::map_anon(self.chunk_bytes).map_err(failed("get memory for", &self.directory))?;
             self.memory_chunks += 1;
-            return Ok(ChunkStorage::Memory(Vec::with_capacity(self.chunk_bytes)));
+            return Ok(ChunkStorage::Memory(bytes));
         }
         if let Some(place) = self.free.pop() {
             return Ok(place);
