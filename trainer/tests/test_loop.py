@@ -237,7 +237,7 @@ def test_a_loss_that_is_no_number_saves_its_batch(tmp_path: Path) -> None:
 class ProcessChannel(SyntheticChannel):
     """What `caraware.ipc.channel.Channel` would be in the process under test."""
 
-    def __init__(self, run_file_path: str, first_tick: int = 0) -> None:
+    def __init__(self, run_file_path: str, first_tick: int = 0, *, place: object = None) -> None:
         run = json.loads(Path(run_file_path).read_text())
         super().__init__(run, with_evaluation(32, 4, 16, 5.0, 1))
 
@@ -245,7 +245,7 @@ class ProcessChannel(SyntheticChannel):
 class TerminatedChannel(SyntheticChannel):
     """... whose supervisor asks the process to stop at tick 25."""
 
-    def __init__(self, run_file_path: str, first_tick: int = 0) -> None:
+    def __init__(self, run_file_path: str, first_tick: int = 0, *, place: object = None) -> None:
         super().__init__(json.loads(Path(run_file_path).read_text()), self._ticks())
 
     @staticmethod
