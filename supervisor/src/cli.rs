@@ -167,7 +167,8 @@ const HANDOVER: &str = "Examples:
 
 The successor starts beside the old trainer. Once it is ready, the old trainer writes a checkpoint and leaves. If the successor
 fails, the handover is refused and the old trainer continues; if it fails before its first commit, the one before it returns.
-Trainers that learn together are replaced together, after an update; --now is refused for them (docs/parallel.md).";
+Trainers that learn together are replaced together. With --now they do not write a checkpoint: their successors begin at the
+newest one that all have, and learn again from what came after it (docs/parallel.md).";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning

@@ -511,8 +511,6 @@ def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     for name in names:
         code, said = answer(ask(tmp_path, registry, "control", "pause", "--run", name))
         assert code == 0, said
-    code, said = answer(ask(tmp_path, registry, "handover", "handed", "--now"))
-    assert code == 2 and "leave together, after an update" in said, said
     # The successor of rank 0 is ready, that of rank 1 ends: both old trainers continue.
     code, said = answer(ask(tmp_path, registry, "handover", "handed", "--set=trainer.module=refuser"))
     assert code == 1 and "the old trainer continues" in said, said
@@ -530,6 +528,40 @@ def test_a_handover_replaces_the_trainers_of_all_ranks_after_one_update(
     for name in names:
         written = report(tmp_path / name)
         assert (len(written["handovers"]), written["restarts"]) == (1, 0)
+
+
+def test_a_handover_now_replaces_the_trainers_of_all_ranks_wherever_they_are(
+    tmp_path: Path, registry: Path, whole: WholeRun
+) -> None:
+    names = ("now", "now-rank1")
+    # With a checkpoint after every second update, ticks that were learnt from are sent again.
+    now = two_ranks(tmp_path, registry, "now", "trainer.checkpoint_interval=2", "run.real_time_factor=2")
+    runs = [tmp_path / name for name in names]
+    wait_until(lambda: all(map(has_begun, runs)), now)
+    replaced = []
+
+    def replace_trainers(*more: str) -> None:
+        code, said = answer(ask(tmp_path, registry, "handover", "now", "--now", *more))
+        assert code == 0 and all(f"{name}: trainer" in said for name in names), said
+        replaced.append(said)
+
+    replace_trainers()
+    wait_until(lambda: (runs[1] / "checkpoints" / "update-000002").exists(), now)
+    for name in names:
+        code, said = answer(ask(tmp_path, registry, "control", "pause", "--run", name))
+        assert code == 0, said
+    # Paused ranks do not have to be resumed for it.
+    replace_trainers("--timeout-s=120")
+    for name in names:
+        code, said = answer(ask(tmp_path, registry, "control", "resume", "--run", name))
+        assert code == 0, said
+    replace_trainers()
+    said, _ = now.communicate(timeout=PATIENCE_S)
+    assert now.returncode == 0, said
+    assert_undisturbed(tmp_path, names, whole)
+    for run in runs:
+        written = report(run)
+        assert (len(written["handovers"]), written["restarts"]) == (len(replaced), 0)
 
 
 def test_a_successor_that_dies_after_the_old_trainers_have_left_does_not_end_the_launch(

@@ -118,12 +118,17 @@ impl Handovers {
 
     /// Asks the old trainer to leave, if a ready successor waits for that and the trainer can be asked.
     fn ask_trainer_to_leave(&mut self, processes: &mut RunProcesses) {
-        let can_be_asked = matches!(processes.state_of(Process::Trainer), State::Ready | State::Running);
-        if let Some(handover) = self.current.take_if(|handover| handover.may_ask() && can_be_asked)
+        let is_working = matches!(processes.state_of(Process::Trainer), State::Ready | State::Running);
+        let can_leave =
+            |handover: &mut HandoverInProgress| handover.may_ask() && (is_working || handover.leave_time().is_none());
+        if let Some(handover) = self.current.take_if(can_leave)
             && let Some(index) = processes.replaceable()
         {
             processes.set_handing_over(true);
-            processes.ask_to_leave(index, handover.leave_time());
+            match handover.leave_time() {
+                Some(when) => processes.ask_to_leave(index, when),
+                None => processes.kill_one(index),
+            }
             self.is_trainer_leaving = true;
             self.current = Some(handover.trainer_asked());
         }
@@ -140,7 +145,7 @@ impl Handovers {
         index: usize,
         ended: &EndedProcess,
     ) -> Result<bool, Exit> {
-        let Some(handover) = self.current.take() else {
+        let Some(mut handover) = self.current.take() else {
             return Ok(false);
         };
         if handover.is_opening() && !ended.is_done {
@@ -150,7 +155,7 @@ impl Handovers {
         }
         // The trainers of other ranks are still at work: the killed one is started again, and all of them meet.
         let was_killed = ended.status.signal().is_some() && !handover.is_together();
-        let may_follow = was_killed || self.is_trainer_leaving;
+        let may_follow = was_killed || self.is_trainer_leaving || handover.follows_any_end();
         if ended.is_done || !may_follow {
             self.current = Some(handover);
             self.refuse_current(

@@ -85,12 +85,16 @@ impl HandoverInProgress {
         }
     }
 
-    /// When the old trainer has to leave.
+    /// When the old trainer has to leave; `None` if it is killed.
+    ///
+    /// Of trainers that learn together one may wait for the others' gradients while these wait for a tick: they cannot all leave at the
+    /// next tick. So they die, and their successors begin at the newest checkpoint that all have.
     #[must_use]
-    pub fn leave_time(&self) -> LeaveTime {
-        match self.request.now {
-            true => LeaveTime::NextTick,
-            false => LeaveTime::NextUpdate,
+    pub fn leave_time(&self) -> Option<LeaveTime> {
+        match (self.request.now, self.request.together) {
+            (false, _) => Some(LeaveTime::NextUpdate),
+            (true, false) => Some(LeaveTime::NextTick),
+            (true, true) => None,
         }
     }
 
@@ -144,15 +148,9 @@ impl HandoverInProgress {
             );
             return Some(failure);
         }
-        if !self.is_permitted {
-            match self.reply.permission() {
-                Permission::Awaited => {}
-                Permission::Given => self.is_permitted = true,
-                Permission::Withdrawn => {
-                    let message = "the handover was withdrawn: the old trainer continues";
-                    return Some(Failure::new(FailureKind::Run, message));
-                }
-            }
+        if self.look_for_permission() == Permission::Withdrawn {
+            let message = "the handover was withdrawn: the old trainer continues";
+            return Some(Failure::new(FailureKind::Run, message));
         }
         limit.filter(|limit| self.since.elapsed() > *limit).map(|limit| {
             let message = format!("{what} within {} s: the old trainer continues", limit.as_secs_f64());
@@ -160,6 +158,24 @@ impl HandoverInProgress {
                 "logs/trainer.log in the run directory says what both do; `--now` does not wait for an update",
             )
         })
+    }
+
+    /// Notes whether the old trainer may be asked to leave by now.
+    fn look_for_permission(&mut self) -> Permission {
+        if self.is_permitted {
+            return Permission::Given;
+        }
+        let permission = self.reply.permission();
+        self.is_permitted = permission == Permission::Given;
+        permission
+    }
+
+    /// True if the successors of all ranks are ready and replace trainers that are killed: the end of the old one, whatever ended it, is
+    /// what the successor waits for. It may end before it is killed, because it sees that another rank's has been replaced.
+    pub fn follows_any_end(&mut self) -> bool {
+        self.leave_time().is_none()
+            && matches!(self.phase, HandoverPhase::Waiting { .. })
+            && self.look_for_permission() == Permission::Given
     }
 
     /// True if the trainers of other ranks are replaced with this one.

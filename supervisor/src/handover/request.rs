@@ -78,13 +78,13 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
         timeout_s: args.timeout_s.map(timeout_s).transpose()?,
         together: run.config.trainer.ranks > 1,
     };
-    let runs = ranks(&run, args.now)?;
+    let runs = ranks(&run)?;
     let requests = runs
         .iter()
         .map(|run| SentRequest::new(run, &SupervisorRequest::Handover(request.clone())));
     let mut requests: Vec<SentRequest> = requests.collect::<Result<_, _>>()?;
     if request.together {
-        // No old trainer leaves before all successors are ready: they leave after the same update.
+        // No old trainer leaves before all successors are ready: they leave after the same update, or now.
         let refused = requests.iter_mut().find_map(|sent| match sent.answer() {
             Ok(HandoverAnswer::Refused(failure)) => Some(failure.into()),
             Ok(_) => None,
@@ -123,19 +123,10 @@ fn print_answer(run: &RunFile, answer: HandoverAnswer) -> Result<(), Exit> {
 }
 
 /// The runs whose trainers are replaced together: `run` alone, or those of all ranks.
-fn ranks(run: &RunFile, now: bool) -> Result<Vec<RunFile>, Exit> {
+fn ranks(run: &RunFile) -> Result<Vec<RunFile>, Exit> {
     let ranks = run.config.trainer.ranks;
     if ranks == 1 {
         return Ok(vec![run.clone()]);
-    }
-    if now {
-        return Err(Exit::config(
-            format!(
-                "the {ranks} ranks that learn with {} cannot leave at any tick",
-                run.name
-            ),
-            "they leave together, after an update: leave out `--now`",
-        ));
     }
     let runs = registry::ranks_of(run);
     if runs.len() != ranks as usize {
