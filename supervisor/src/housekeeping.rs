@@ -70,9 +70,15 @@ impl Housekeeping {
     }
 }
 
+/// True if the disk of `path` is full.
+#[must_use]
+pub fn is_disk_full(path: &Path) -> bool {
+    free_bytes(path).is_ok_and(|free| free < FULL_BYTES)
+}
+
 /// Reports a disk that becomes full, and one that has space again. True if it is full.
 fn look_at_disk(run_dir: &Path, was_full: bool, figures: &mut HousekeepingFigures) -> bool {
-    let is_full = free_bytes(run_dir).is_ok_and(|free| free < FULL_BYTES);
+    let is_full = is_disk_full(run_dir);
     match (was_full, is_full) {
         (false, true) => {
             figures.disk_full += 1;

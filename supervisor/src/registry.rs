@@ -30,6 +30,8 @@ const MARKER: &str = "caraware-run.json";
 const PROGRAM: &str = "caraware";
 /// Largest valid marker, bytes.
 const MARKER_BYTES: u64 = 16 << 10;
+/// What the name of a directory begins with until it is complete.
+const UNNAMED: char = '.';
 /// Hexadecimal digits of a directory's name.
 const NAME_DIGITS: usize = 8;
 
@@ -66,7 +68,11 @@ impl RunMarker {
 
     /// The marker of a directory that this program wrote for this user; `None` for every other directory. Links are not followed.
     fn of(directory: &Path) -> Option<Self> {
-        let name = directory.file_name()?.to_str()?;
+        Self::of_named(directory, directory.file_name()?.to_str()?)
+    }
+
+    /// As [`Self::of`], of a directory that would be called `name` if it were complete.
+    fn of_named(directory: &Path, name: &str) -> Option<Self> {
         let is_name = name.len() == NAME_DIGITS && name.bytes().all(|byte| byte.is_ascii_hexdigit());
         let data = directory.symlink_metadata().ok()?;
         if !is_name || !data.is_dir() || data.uid() != user_id() {
@@ -175,6 +181,13 @@ fn remove_base(base: &Path) -> std::io::Result<()> {
     std::fs::remove_dir(base).or_else(|_| mark_base(base))
 }
 
+/// As [`remove_base`]. A failure is only logged: the next run tries again.
+fn forget_base(base: &Path) {
+    if let Err(error) = remove_base(base) {
+        tracing::debug!(%error, "cannot remove the runtime directory");
+    }
+}
+
 /// A run's own part of shared memory. Dropping it removes its files.
 #[derive(Debug)]
 pub struct RunClaim {
@@ -199,24 +212,16 @@ impl RunClaim {
         let name = format!("{:08x}", run_id >> 32);
         let base = create_base()?;
         let directory = base.join(&name);
-        let unnamed = base.join(format!(".{name}"));
-        DirBuilder::new()
-            .mode(0o700)
-            .create(&unnamed)
-            .map_err(|error| Exit::io("create", &unnamed, &error))?;
-        let path = unnamed.join(LOCK);
-        let lock = OpenOptions::new()
-            .create_new(true)
-            .write(true)
-            .mode(0o600)
-            .open(&path)
-            .map_err(|error| Exit::io("create", &path, &error))?;
-        flock(&lock, FlockOperation::NonBlockingLockExclusive)
-            .map_err(|error| Exit::io("lock", &path, &error.into()))?;
-        RunMarker::new(run_dir)
-            .write(&unnamed)
-            .map_err(|error| Exit::io("write", &unnamed.join(MARKER), &error))?;
-        std::fs::rename(&unnamed, &directory).map_err(|error| Exit::io("create", &directory, &error))?;
+        let unnamed = base.join(format!("{UNNAMED}{name}"));
+        let named = make_unnamed(&unnamed, run_dir).and_then(|lock| {
+            std::fs::rename(&unnamed, &directory).map_err(|error| Exit::io("create", &directory, &error))?;
+            Ok(lock)
+        });
+        let lock = named.inspect_err(|_| {
+            // It is not there if it could not be created.
+            let _ = std::fs::remove_dir_all(&unnamed);
+            forget_base(&base);
+        })?;
         let memory = SharedMemory {
             root: directory.clone(),
             prefix: prefix(&name),
@@ -235,10 +240,28 @@ impl Drop for RunClaim {
         remove(&self.directory);
         // A client that was attaching to a run while that run died may have created a file after the sweep at the start.
         sweep();
-        if let Err(error) = remove_base(&base()) {
-            tracing::debug!(%error, "cannot remove the runtime directory");
-        }
+        forget_base(&base());
     }
+}
+
+/// Creates the directory of the run in `run_dir` under its first name, with its lock and its marker, in this order. Returns the lock.
+fn make_unnamed(unnamed: &Path, run_dir: &Path) -> Result<File, Exit> {
+    DirBuilder::new()
+        .mode(0o700)
+        .create(unnamed)
+        .map_err(|error| Exit::io("create", unnamed, &error))?;
+    let path = unnamed.join(LOCK);
+    let lock = OpenOptions::new()
+        .create_new(true)
+        .write(true)
+        .mode(0o600)
+        .open(&path)
+        .map_err(|error| Exit::io("create", &path, &error))?;
+    flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|error| Exit::io("lock", &path, &error.into()))?;
+    RunMarker::new(run_dir)
+        .write(unnamed)
+        .map_err(|error| Exit::io("write", &unnamed.join(MARKER), &error))?;
+    Ok(lock)
 }
 
 pub(crate) fn random_u64() -> Result<u64, Exit> {
@@ -300,8 +323,7 @@ pub fn foreign_paths() -> Vec<PathBuf> {
 impl RegistryEntry {
     fn read(directory: PathBuf) -> Option<Self> {
         let marker = RunMarker::of(&directory)?;
-        let alive = File::open(directory.join(LOCK))
-            .is_ok_and(|lock| flock(&lock, FlockOperation::NonBlockingLockShared).is_err());
+        let alive = is_locked(&directory);
         let run = RunFile::read(&marker.run_dir.join("run.json")).ok();
         Some(Self { directory, alive, run })
     }
@@ -357,8 +379,25 @@ fn remove(directory: &Path) {
     }
 }
 
+/// True if a process holds the lock of a run's directory.
+fn is_locked(directory: &Path) -> bool {
+    File::open(directory.join(LOCK)).is_ok_and(|lock| flock(&lock, FlockOperation::NonBlockingLockShared).is_err())
+}
+
+/// Removes the directory of a run that was killed before that had its name, which is the last step: it holds nothing yet.
+fn remove_unnamed(path: &Path) {
+    let name = path.file_name().and_then(|name| name.to_str()?.strip_prefix(UNNAMED));
+    if name.is_some_and(|name| RunMarker::of_named(path, name).is_some())
+        && !is_locked(path)
+        && let Err(error) = std::fs::remove_dir_all(path)
+    {
+        tracing::debug!(%error, path = %path.display(), "cannot remove");
+    }
+}
+
 /// Removes the files of all dead runs, and returns the number of these runs.
 pub fn sweep() -> usize {
+    paths().iter().for_each(|path| remove_unnamed(path));
     let dead: Vec<RegistryEntry> = entries().into_iter().filter(|entry| !entry.alive).collect();
     dead.iter().for_each(RegistryEntry::clean);
     dead.len()
@@ -515,6 +554,22 @@ mod tests {
         for directory in foreign {
             assert_eq!(RunMarker::of(&directory), None, "{}", directory.display());
         }
+    }
+
+    #[test]
+    fn a_directory_without_its_name_is_removed_once_its_lock_is_free() {
+        let base = tempfile::tempdir().unwrap();
+        let unnamed = base.path().join(".0123abcd");
+        let lock = make_unnamed(&unnamed, Path::new("/nowhere")).unwrap();
+        assert!(RegistryEntry::read(unnamed.clone()).is_none());
+        remove_unnamed(&unnamed);
+        assert!(unnamed.is_dir());
+        drop(lock);
+        // A directory of the user that is called alike has no marker.
+        let foreign = base.path().join(".0123abce");
+        std::fs::create_dir(&foreign).unwrap();
+        [&unnamed, &foreign].into_iter().for_each(|path| remove_unnamed(path));
+        assert!(!unnamed.exists() && foreign.is_dir());
     }
 
     #[test]

@@ -24,7 +24,8 @@ use crate::{
     cli::{RunArgs, TrainArgs, ViewerKind},
     display::notice,
     failure::Exit,
-    preparation_mark,
+    housekeeping::is_disk_full,
+    preparation_mark, registry,
     restart::{EndCause, RequiredRestarts, RestartVerdict},
 };
 
@@ -61,8 +62,13 @@ pub fn train(args: &TrainArgs) -> Result<ExitCode, Exit> {
         };
         notice(&format!("{what}; the run resumes in {:.1} s", pause.as_secs_f64()));
         let due = Instant::now() + pause;
-        while Instant::now() < due {
-            if run.wait_for_signal(&signals, due - Instant::now()) {
+        let mut has_said = false;
+        while Instant::now() < due || run.is_without_space() {
+            let left = due.saturating_duration_since(Instant::now());
+            if left.is_zero() && !std::mem::replace(&mut has_said, true) {
+                notice("the disk is full: the run resumes once there is space");
+            }
+            if run.wait_for_signal(&signals, if left.is_zero() { LOOK } else { left }) {
                 return Err(Exit::Interrupted);
             }
         }
@@ -161,6 +167,12 @@ impl RelaunchedRun {
         {
             notice(&format!("cannot remove {}: {error}", claimed.display()));
         }
+    }
+
+    /// True if the disk of the run, or that of iceoryx2's files, is full: a resume would be refused.
+    fn is_without_space(&self) -> bool {
+        let directory = self.directory.as_ref().unwrap_or(&self.args.run.runs);
+        is_disk_full(directory) || is_disk_full(&registry::base())
     }
 
     /// Number of restarts before which there was a checkpoint that the restart before did not have.

@@ -292,9 +292,7 @@ impl<'a> DisturbedRun<'a> {
     fn look(&mut self) {
         let directory = self.directory();
         if let Ok(run) = RunFile::read(&directory.join("run.json")) {
-            // The file of a killed supervisor is there until its successor has written its own.
-            let is_of_child = run.supervisor_pid == pid(&self.child).as_raw_nonzero().get();
-            if self.watched.is_none() && is_of_child {
+            if self.watched.is_none() && self.wrote(&run) {
                 self.watched = WatchedBoards::open(&run, self.case.envs);
             }
             self.prefixes.insert(run.shared_memory.prefix);
@@ -312,6 +310,15 @@ impl<'a> DisturbedRun<'a> {
                 *peak = (peak.0.max(resident_mib), peak.1.max(handles));
             }
         }
+    }
+
+    /// True if the supervisor that lives wrote this run file: that of a killed one is there until its successor has written its own.
+    fn wrote(&self, run: &RunFile) -> bool {
+        run.supervisor_pid == pid(&self.child).as_raw_nonzero().get()
+    }
+
+    fn is_prepared(&self) -> bool {
+        RunFile::read(&self.directory().join("run.json")).is_ok_and(|run| self.wrote(&run))
     }
 
     /// Returns false if there was no process to disturb.
@@ -436,9 +443,19 @@ impl<'a> DisturbedRun<'a> {
     }
 
     /// Waits for the end of a handover. Returns false if it was not made.
-    fn count_handover(&mut self, client: Child) -> Result<bool, Exit> {
-        let output = client.wait_with_output();
-        let output = output.map_err(|error| Exit::io("wait for", &self.place.caraware, &error))?;
+    fn count_handover(&mut self, mut client: Child) -> Result<bool, Exit> {
+        let failed = |error: &std::io::Error| Exit::io("wait for", &self.place.caraware, error);
+        let begun = Instant::now();
+        while client.try_wait().map_err(|error| failed(&error))?.is_none() {
+            if begun.elapsed() > DEADLINE {
+                self.fault(&format!("a handover had no answer within {} s", DEADLINE.as_secs()));
+                // It may end just now.
+                let _ = client.kill();
+                break;
+            }
+            pause();
+        }
+        let output = client.wait_with_output().map_err(|error| failed(&error))?;
         if output.status.success() {
             self.counts.count("handover made");
             return Ok(true);
@@ -485,8 +502,8 @@ impl<'a> DisturbedRun<'a> {
 
     /// Leaves no byte on the disk for a while, also if the run removes files.
     fn fill_disk(&mut self) -> Result<bool, Exit> {
-        // A run that is not prepared yet is refused on a full disk.
-        if !self.directory().join("run.json").exists() {
+        // A run that this process has not prepared yet is refused on a full disk.
+        if !self.is_prepared() {
             return Ok(false);
         }
         let path = self.place.directory.join("ballast");

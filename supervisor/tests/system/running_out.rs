@@ -219,11 +219,11 @@ struct RunOnFullDisk {
 }
 
 impl RunOnFullDisk {
-    /// `None` if this system allows no mounts.
-    fn start(workplace: &Workplace, settings: &[&str]) -> Option<Self> {
+    /// `None` if this system allows no mounts. `options` are the command's, `settings` the run's.
+    fn start(workplace: &Workplace, options: &[&str], settings: &[&str]) -> Option<Self> {
         let small = workplace.path().join("small");
         std::fs::create_dir(&small).unwrap();
-        let arguments = [&train("full", settings)[..], &["--runs", "small"]].concat();
+        let arguments = [&train("full", settings)[..], options, &["--runs", "small"]].concat();
         let mount = format!("mount -t tmpfs -o size=48m none {}", small.display());
         let mut command = workplace.command(&arguments);
         command.env("CARAWARE_RUNTIME_DIR", small.join("r"));
@@ -246,6 +246,22 @@ impl RunOnFullDisk {
             _held: held,
             said,
         })
+    }
+
+    /// A command of caraware that sees the run's disk.
+    fn inside(&self, workplace: &Workplace, arguments: &[&str]) -> Command {
+        let alone = workplace.command(arguments);
+        let mut inside = Command::new("nsenter");
+        inside.args(["--target", &self.run.id().to_string(), "--mount"]);
+        if !rustix::process::getuid().is_root() {
+            inside.args(["--user", "--preserve-credentials"]);
+        }
+        inside.args(["sh", "-c", "cd \"$0\" && exec \"$@\""]);
+        inside.arg(alone.get_current_dir().unwrap());
+        inside.arg(alone.get_program()).args(alone.get_args());
+        inside.envs(alone.get_envs().filter_map(|(key, value)| Some((key, value?))));
+        inside.env("CARAWARE_RUNTIME_DIR", workplace.path().join("small/r"));
+        inside
     }
 
     fn wait_until_it_says(&mut self, words: &str) {
@@ -280,6 +296,44 @@ impl RunOnFullDisk {
     }
 }
 
+/// A killed supervisor is started again once there is space. Another run is refused meanwhile, and leaves nothing.
+#[test]
+fn a_run_with_restart_waits_for_space_before_it_resumes() {
+    let workplace = Workplace::new();
+    let longer = ["episode.training_episodes=10"];
+    workplace.succeed(&train("alone", &longer));
+    let reference = workplace.report("alone")["observation_hash"].clone();
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &["--restart"], &longer) else {
+        return;
+    };
+    full.wait_until_it_says("is full");
+    let run: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(full.disk.join("full/run.json")).unwrap()).unwrap();
+    let supervisor = i32::try_from(run["supervisor_pid"].as_i64().unwrap()).unwrap();
+    kill_process(Pid::from_raw(supervisor).unwrap(), Signal::KILL).unwrap();
+    full.wait_until_it_says("the run resumes once there is space");
+    // Its results would go to another disk.
+    let other = full.inside(&workplace, &train("other", &[])).output().unwrap();
+    assert_eq!(other.status.code(), Some(1), "{}", text(&other));
+    assert!(text(&other).contains("caraware-run.json"), "{}", text(&other));
+    let left = std::fs::read_dir(full.disk.join("r")).into_iter().flatten().flatten();
+    let unnamed: Vec<_> = left
+        .map(|entry| entry.file_name())
+        .filter(|name| name.to_string_lossy().len() == ".0123abcd".len())
+        .collect();
+    assert!(unnamed.is_empty(), "{unnamed:?}");
+    let (report, said, _) = full.finish();
+    assert_eq!(
+        (&report["result"], &report["observation_hash"]),
+        (&"completed".into(), &reference),
+        "{said}"
+    );
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+}
+
 /// What the processes of the run on `disk` have logged.
 fn logs(disk: &Path) -> String {
     let logs = std::fs::read_dir(disk.join("full/logs")).unwrap().flatten();
@@ -293,7 +347,7 @@ fn a_full_disk_is_waited_for() {
     let longer = ["episode.training_episodes=10"];
     workplace.succeed(&train("alone", &longer));
     let reference = workplace.report("alone")["observation_hash"].clone();
-    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &[], &longer) else {
         return;
     };
     // Whichever process is the first to need space waits for it.
@@ -317,7 +371,7 @@ fn processes_that_die_while_the_disk_is_full_are_replaced() {
     let longer = ["episode.training_episodes=10"];
     workplace.succeed(&train("alone", &longer));
     let reference = workplace.report("alone")["observation_hash"].clone();
-    let Some(mut full) = RunOnFullDisk::start(&workplace, &longer) else {
+    let Some(mut full) = RunOnFullDisk::start(&workplace, &[], &longer) else {
         return;
     };
     full.wait_until_it_says("is full");
