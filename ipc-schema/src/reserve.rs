@@ -93,6 +93,11 @@ fn path(memory: &SharedMemory) -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("{}reserve", memory.prefix))
 }
 
+/// True if `file` is the reserve, which is empty once all of it is in use.
+pub(crate) fn is_reserve(memory: &SharedMemory, file: &Path) -> bool {
+    file == path(memory)
+}
+
 /// Free bytes of shared memory.
 #[must_use]
 pub fn free_bytes() -> u64 {

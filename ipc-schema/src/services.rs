@@ -6,7 +6,7 @@ use std::{
     fs::{File, Metadata},
     io::ErrorKind,
     os::unix::fs::MetadataExt as _,
-    path::Path,
+    path::{Path, PathBuf},
     sync::Arc,
 };
 
@@ -148,7 +148,6 @@ pub fn node(memory: &SharedMemory) -> Result<RunNode, ServiceError> {
 
 /// True if the directory is not at `path` any more; another one may be.
 fn has_been_removed(directory: &File, path: &Path) -> bool {
-    let is_same = |one: &Metadata, other: &Metadata| (one.dev(), one.ino()) == (other.dev(), other.ino());
     match (directory.metadata(), std::fs::metadata(path)) {
         (Ok(opened), Ok(found)) => !is_same(&opened, &found),
         _ => true,
@@ -176,8 +175,54 @@ pub fn remove_files(memory: &SharedMemory) {
     remove_shared(memory);
 }
 
+/// Removes files of a run in shared memory that their creators were killed before giving a size.
+///
+/// iceoryx2 creates a file and then sets its size. Who opens it waits for that: in version 0.10 for ever, if it may read the files of
+/// others (`root` may), because the time limit of the wait is not asked there. Without the file the wait is over.
+pub fn remove_unfinished(memory: &SharedMemory) {
+    let is_unfinished = |path: &Path| {
+        path.symlink_metadata()
+            .ok()
+            .filter(|data| data.is_file() && data.len() == 0)
+    };
+    let found = reserve::files(memory).filter_map(|path| is_unfinished(&path).map(|data| (path, data)));
+    let mut unfinished: Vec<(PathBuf, Metadata)> =
+        found.filter(|(path, _)| !reserve::is_reserve(memory, path)).collect();
+    if unfinished.is_empty() {
+        return;
+    }
+    for open in open_files() {
+        unfinished.retain(|(_, data)| !is_same(data, &open));
+    }
+    // A creator that lives has the file open; it may have set the size meanwhile, and closed it.
+    for (path, _) in unfinished {
+        if is_unfinished(&path).is_some() {
+            tracing::debug!(path = %path.display(), "a killed process had not given it a size: it is removed");
+            // Someone else may have removed it.
+            let _ = std::fs::remove_file(&path);
+        }
+    }
+}
+
+/// What the open files are of all processes that this user may look into.
+fn open_files() -> impl Iterator<Item = Metadata> {
+    let entries = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten();
+    let processes = entries(Path::new("/proc"));
+    let handles = processes.flat_map(move |process| entries(&process.path().join("fd")));
+    handles.filter_map(|handle| std::fs::metadata(handle.path()).ok())
+}
+
+fn is_same(one: &Metadata, other: &Metadata) -> bool {
+    (one.dev(), one.ino()) == (other.dev(), other.ino())
+}
+
 /// Takes what dead processes left in the services that others hold open: their places there are free again.
 pub fn forget_dead(node: &RunNode) {
+    let global = &node.config().global;
+    remove_unfinished(&SharedMemory {
+        root: PathBuf::from(global.root_path().to_string()),
+        prefix: global.prefix.to_string(),
+    });
     let state = node.try_cleanup_dead_nodes();
     if state.failed_cleanups > 0 {
         tracing::warn!(?state, "a dead process is still in the way");

@@ -1,4 +1,5 @@
-//! What the supervisor looks after beside the processes: the space of the run's disk, and the size of the logs.
+//! What the supervisor looks after beside the processes: the space of the run's disk, the size of the logs, and unfinished
+//! files in shared memory.
 
 use std::{
     fs::{File, OpenOptions},
@@ -9,13 +10,16 @@ use std::{
     time::Duration,
 };
 
-use ipc_schema::run::RunFile;
+use ipc_schema::{run::RunFile, services};
 use serde::Serialize;
 
 use crate::{display::notice, prepare::free_bytes};
 
 /// Time between two looks.
 const INTERVAL: Duration = Duration::from_millis(250);
+/// Every so many looks there is one at the files in shared memory: any process, the supervisor too, may wait for one that a killed
+/// process has left unfinished.
+const TURNS_OF_MEMORY: u32 = 4;
 /// Below this many free bytes the disk counts as full: file systems keep the last blocks to themselves.
 const FULL_BYTES: u64 = 64 << 10;
 /// Largest size of a log, bytes. A longer one is kept in two parts of this size, its first and its newest.
@@ -44,10 +48,17 @@ impl Housekeeping {
         let logs: Vec<PathBuf> = (0..run.config.run.envs)
             .map(|index| run.environment(index).run_dir.join("logs"))
             .collect();
+        let memory = run.shared_memory.clone();
         let (sender, ended) = channel::<()>();
         let look = move || {
             let (mut figures, mut was_full) = (HousekeepingFigures::default(), false);
-            while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(INTERVAL) {
+            for turn in 1_u32.. {
+                if ended.recv_timeout(INTERVAL) != Err(RecvTimeoutError::Timeout) {
+                    break;
+                }
+                if turn % TURNS_OF_MEMORY == 0 {
+                    services::remove_unfinished(&memory);
+                }
                 was_full = look_at_disk(&run_dir, was_full, &mut figures);
                 logs.iter().for_each(|logs| shorten_logs(logs, LOG_BYTES, &mut figures));
             }
