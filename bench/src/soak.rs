@@ -369,7 +369,7 @@ mod tests {
     fn peaks_after_handovers_are_no_growth_and_steps_are() {
         // Ten hours, one sample a minute, and a peak of 20 MiB in one minute of five, more of them late than early.
         let samples = |rise: fn(f64) -> f64| -> Vec<(f64, f64)> {
-            let is_peak = |n: u32| n % 5 == 0 && n > 200;
+            let is_peak = |n: u32| n.is_multiple_of(5) && n > 200;
             (0..600)
                 .map(|n| (f64::from(n) / 60.0, if is_peak(n) { 55.0 } else { 35.0 }))
                 .map(|(at_h, value)| (at_h, value + rise(at_h)))

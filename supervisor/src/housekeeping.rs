@@ -56,7 +56,7 @@ impl Housekeeping {
                 if ended.recv_timeout(INTERVAL) != Err(RecvTimeoutError::Timeout) {
                     break;
                 }
-                if turn % TURNS_OF_MEMORY == 0 {
+                if turn.is_multiple_of(TURNS_OF_MEMORY) {
                     services::remove_unfinished(&memory);
                 }
                 was_full = look_at_disk(&run_dir, was_full, &mut figures);
