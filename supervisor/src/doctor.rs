@@ -217,6 +217,10 @@ fn print_runs(clean: bool) {
     if entries.is_empty() {
         crate::say!("ok       no stale run");
     }
+    if clean {
+        registry::sweep();
+        registry::forget_base(&registry::base());
+    }
     for path in registry::foreign_paths() {
         crate::say!("note     {}: not a run of caraware; it is not touched", path.display());
     }

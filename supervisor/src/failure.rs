@@ -12,6 +12,9 @@ use miette::{Diagnostic, Report};
 
 use crate::{config::ConfigError, display::notice};
 
+/// Exit code after Ctrl-C, as a shell reports it: 128 and the number of SIGINT.
+pub const INTERRUPTED: u8 = 130;
+
 /// The reason why the command ends without success.
 #[derive(Debug)]
 pub enum Exit {
@@ -19,7 +22,7 @@ pub enum Exit {
     Config(Box<ConfigError>),
     /// A failure, printed with its help; its kind decides the exit code.
     Failure(Failure),
-    /// Ctrl-C: exit code 130.
+    /// Ctrl-C: exit code [`INTERRUPTED`].
     Interrupted,
 }
 
@@ -50,7 +53,7 @@ impl Exit {
                 notice(&format!("{:?}", Report::new(ShownFailure(failure))));
                 ExitCode::from(code)
             }
-            Self::Interrupted => ExitCode::from(130),
+            Self::Interrupted => ExitCode::from(INTERRUPTED),
         }
     }
 

@@ -17,6 +17,7 @@ use crate::{
     display,
     failure::Exit,
     install::Install,
+    interruption::remove_when_interrupted,
     scenario::{self, ScenarioReading, input_check::require_regular},
 };
 use demand::ImportedDemand;
@@ -160,7 +161,9 @@ pub fn import(args: &ImportArgs) -> Result<(), Exit> {
         )
     })?;
     let file = std::path::absolute(&args.file).map_err(|error| Exit::io("resolve", &args.file, &error))?;
+    let was_there = args.directory.exists();
     let directory = empty_directory(&args.directory)?;
+    let _removal = remove_when_interrupted(&directory, was_there)?;
     let install = Install::find()?;
     let tools = SumoTools {
         install: &install,

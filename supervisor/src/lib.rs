@@ -18,6 +18,7 @@ pub mod handover;
 pub mod housekeeping;
 pub mod import;
 pub mod install;
+pub mod interruption;
 pub mod live_table;
 pub mod maps;
 pub mod memory_limit;

@@ -80,7 +80,7 @@ fn run(prepared: PreparedRun) -> Result<(), Exit> {
         false => ProgressDisplay::new(),
     };
     let housekeeping = Housekeeping::start(&run);
-    let outcome = match Supervisor::new(&prepared.run, prepared.install, prepared.claim) {
+    let outcome = match Supervisor::new(&prepared.run, prepared.install, prepared.claim, prepared.interruption) {
         Ok(supervisor) => supervisor.supervise(&mut display),
         Err(exit) => RunOutcome::not_started(exit),
     };

@@ -43,12 +43,18 @@ pub fn remove_mark(directory: &Path) -> Result<()> {
     }
 }
 
+/// True if this supervisor prepares `directory`, or prepared it until it ended.
+#[must_use]
+pub fn is_prepared_by(directory: &Path, supervisor_pid: i32) -> bool {
+    mark(directory, supervisor_pid).is_file()
+}
+
 /// Removes `directory` if the ended supervisor prepared it, or if it is empty.
 ///
 /// # Errors
 /// Another program made the directory, which stays as it is, or the directory cannot be written.
 pub fn remove_prepared(directory: &Path, supervisor_pid: i32) -> Result<()> {
-    if mark(directory, supervisor_pid).is_file() {
+    if is_prepared_by(directory, supervisor_pid) {
         return std::fs::remove_dir_all(directory);
     }
     match std::fs::remove_dir(directory) {

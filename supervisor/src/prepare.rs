@@ -20,6 +20,7 @@ use crate::{
     correction::suggest_correction,
     failure::Exit,
     install::Install,
+    interruption::InterruptionWatch,
     maps,
     memory_limit::{MemoryGroups, MemoryLimit},
     preparation_mark,
@@ -49,6 +50,8 @@ pub struct PreparedRun {
     pub quiet: bool,
     /// The viewer to start beside the run, if any.
     pub viewer: Option<ViewerRequest>,
+    /// Notes signals until the supervisor does.
+    pub interruption: InterruptionWatch,
 }
 
 /// The source of traffic that the argument CONFIG selects.
@@ -160,14 +163,17 @@ fn prepare_in_place(
     let viewer = ViewerRequest::of(args, &config.fanout)?;
     registry::sweep();
     system_limits::check_open_files(config.run.envs)?;
-    let (run, claim) = resume::resume_in_place(beginning, old, config, &install)?;
-    reserve_shared_memory(&run)?;
+    let interruption = InterruptionWatch::start()?;
+    let resumed = resume::resume_in_place(beginning, old, config, &install)
+        .and_then(|(run, claim)| reserve_shared_memory(&run).map(|()| (run, claim)));
+    let (run, claim) = interruption.outcome(resumed)?;
     Ok(PreparedRun {
         run,
         install,
         claim,
         quiet: args.quiet,
         viewer,
+        interruption,
     })
 }
 
@@ -208,22 +214,18 @@ fn prepare_new(
     let command_logs = read_command_logs(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
     // From here on the run has a directory.
+    let interruption = InterruptionWatch::start()?;
     let run_dir = create_run_dir(args, label)?;
-    let result = assemble(&run_dir, mode, config, &install, named, scenario_map)
+    let assembled = assemble(&run_dir, mode, config, &install, named, scenario_map)
         .and_then(|assembled| write_command_logs(&run_dir.path, &command_logs).map(|()| assembled));
-    if result.is_err() {
-        // No process has started, so the directory holds nothing of use.
-        if let Err(error) = std::fs::remove_dir_all(&run_dir.path) {
-            tracing::warn!(%error, "cannot remove the run directory");
-        }
-    }
-    let (run, claim) = result?;
+    let (run, claim) = interruption.outcome(assembled).inspect_err(|_| run_dir.remove())?;
     Ok(PreparedRun {
         run,
         install,
         claim,
         quiet: args.quiet,
         viewer,
+        interruption,
     })
 }
 
@@ -374,6 +376,15 @@ fn write_command_logs(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit
 pub(crate) struct RunDirectory {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
+}
+
+impl RunDirectory {
+    /// Removes a directory that holds nothing of use, because no process has started.
+    pub(crate) fn remove(&self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.path) {
+            tracing::warn!(%error, "cannot remove the run directory");
+        }
+    }
 }
 
 /// Creates `runs/<name>`, which must not exist: the given name, or the label with the first free number.

@@ -181,8 +181,8 @@ fn remove_base(base: &Path) -> std::io::Result<()> {
     std::fs::remove_dir(base).or_else(|_| mark_base(base))
 }
 
-/// As [`remove_base`]. A failure is only logged: the next run tries again.
-fn forget_base(base: &Path) {
+/// Removes [`base`] if a run created it and none is left there. A failure is only logged: the next run tries again.
+pub fn forget_base(base: &Path) {
     if let Err(error) = remove_base(base) {
         tracing::debug!(%error, "cannot remove the runtime directory");
     }
@@ -311,12 +311,13 @@ pub fn entries() -> Vec<RegistryEntry> {
     paths().into_iter().filter_map(RegistryEntry::read).collect()
 }
 
-/// Paths in [`base`] that are not runs of this user. They are never changed.
+/// Paths in [`base`] that are neither runs of this user nor its own mark. They are never changed.
 #[must_use]
 pub fn foreign_paths() -> Vec<PathBuf> {
+    let own = base().join(BASE_MARKER);
     paths()
         .into_iter()
-        .filter(|path| RunMarker::of(path).is_none())
+        .filter(|path| *path != own && RunMarker::of(path).is_none())
         .collect()
 }
 

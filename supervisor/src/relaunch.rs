@@ -150,9 +150,12 @@ impl RelaunchedRun {
     /// Finds the directory of the run that the dead supervisor had. A directory that it prepared, and that has no run file yet, is
     /// removed: the run starts again under the same name.
     fn find_directory(&mut self) {
-        let entries = std::fs::read_dir(&self.args.run.runs).into_iter().flatten().flatten();
+        let runs = || {
+            let entries = std::fs::read_dir(&self.args.run.runs).into_iter().flatten().flatten();
+            entries.map(|entry| entry.path())
+        };
         let named = self.args.resume.iter().map(PathBuf::from);
-        let mut candidates = entries.map(|entry| entry.path()).chain(named);
+        let mut candidates = runs().chain(named);
         let is_its_own = |directory: &PathBuf| {
             let run = RunFile::read(&directory.join("run.json"));
             run.is_ok_and(|run| run.supervisor_pid == self.supervisor_pid)
@@ -160,12 +163,17 @@ impl RelaunchedRun {
         if let Some(found) = candidates.find(is_its_own) {
             self.directory = Some(found);
         }
-        if let (None, Some(claimed)) = (&self.directory, &self.claimed)
-            && claimed.is_dir()
-            && !claimed.join("run.json").exists()
-            && let Err(error) = preparation_mark::remove_prepared(claimed, self.supervisor_pid)
+        if self.directory.is_some() {
+            return;
+        }
+        // Without a name from the user it is the marked one.
+        let marked = runs().find(|directory| preparation_mark::is_prepared_by(directory, self.supervisor_pid));
+        if let Some(prepared) = self.claimed.clone().or(marked)
+            && prepared.is_dir()
+            && !prepared.join("run.json").exists()
+            && let Err(error) = preparation_mark::remove_prepared(&prepared, self.supervisor_pid)
         {
-            notice(&format!("cannot remove {}: {error}", claimed.display()));
+            notice(&format!("cannot remove {}: {error}", prepared.display()));
         }
     }
 

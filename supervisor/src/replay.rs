@@ -3,6 +3,7 @@
 use ipc_schema::{
     SCHEMA_VERSION,
     channel::Channel,
+    config::Config,
     run::{Mode, Replay, RunFile},
     storage,
 };
@@ -16,7 +17,8 @@ use crate::{
     config::{self, LayeredSettings},
     failure::Exit,
     install::Install,
-    prepare::{PreparedRun, create_run_dir, reserve_shared_memory},
+    interruption::InterruptionWatch,
+    prepare::{PreparedRun, RunDirectory, create_run_dir, reserve_shared_memory},
     record::recording_path,
     registry::{self, RunClaim},
     remote, resume, system_limits,
@@ -62,7 +64,30 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
     };
     let viewer = ViewerRequest::of(&run_args, &config.fanout)?;
     registry::sweep();
+    let interruption = InterruptionWatch::start()?;
     let run_dir = create_run_dir(&run_args, &format!("{}-replay", old.name))?;
+    let assembled = assemble(args, mode, &run_dir, config, old, &recording, &install);
+    let (run, claim) = interruption.outcome(assembled).inspect_err(|_| run_dir.remove())?;
+    Ok(PreparedRun {
+        run,
+        install,
+        claim,
+        quiet: args.quiet,
+        viewer,
+        interruption,
+    })
+}
+
+/// Fills the directory of a run that replays `recording`, the one of the run `old`, and claims its shared memory.
+fn assemble(
+    args: &ReplayArgs,
+    mode: Mode,
+    run_dir: &RunDirectory,
+    config: Config,
+    old: RunFile,
+    recording: &RecordingReader,
+    install: &Install,
+) -> Result<(RunFile, RunClaim), Exit> {
     for part in ["logs", "parts", "map"] {
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
@@ -82,8 +107,8 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
         schema_version: SCHEMA_VERSION,
         env_index: 0,
         run_id: claim.run_id,
-        name: run_dir.name,
-        run_dir: run_dir.path,
+        name: run_dir.name.clone(),
+        run_dir: run_dir.path.clone(),
         mode,
         supervisor_pid: i32::try_from(std::process::id()).unwrap_or(0),
         shared_memory: claim.memory.clone(),
@@ -92,7 +117,10 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
         config_hash,
         beginning: None,
         restart: None,
-        replay: Some(Replay { file, from_tick }),
+        replay: Some(Replay {
+            file: recording.path().to_owned(),
+            from_tick,
+        }),
         ..old
     };
     if let Some(chart) = recording.attachment(CHART) {
@@ -100,13 +128,7 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
         storage::write_whole(&path, chart).map_err(|error| Exit::io("write", &path, &error))?;
     }
     reserve_shared_memory(&run)?;
-    Ok(PreparedRun {
-        run,
-        install,
-        claim,
-        quiet: args.quiet,
-        viewer,
-    })
+    Ok((run, claim))
 }
 
 /// True if the recording has a message of a channel; what is damaged is reported when it is played.

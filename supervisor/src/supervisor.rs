@@ -30,6 +30,7 @@ use crate::{
     failure::Exit,
     handover::Handovers,
     install::Install,
+    interruption::InterruptionWatch,
     memory_limit::MemoryGroups,
     processes::{EndedProcess, RunProcesses},
     registry::{self, RunClaim},
@@ -139,9 +140,18 @@ impl Supervisor {
     ///
     /// # Errors
     /// The run directory is not writable, or iceoryx2 refuses.
-    pub fn new(run: &RunFile, install: Install, claim: RunClaim) -> Result<Self, Exit> {
+    pub fn new(
+        run: &RunFile,
+        install: Install,
+        claim: RunClaim,
+        interruption: InterruptionWatch,
+    ) -> Result<Self, Exit> {
         let (event_sender, events) = channel();
         let signal_handle = watch_signals(event_sender.clone())?;
+        if interruption.finish() {
+            // Nobody has ended the receiver yet.
+            let _ = event_sender.send(SupervisorEvent::Signal(SIGINT));
+        }
         let sender = event_sender.clone();
         socket::listen(run, move |request| {
             sender.send(SupervisorEvent::Request(request)).is_ok()

@@ -1,10 +1,11 @@
 //! Scenarios from maps: the extract of OpenStreetMap in SUMO's wheel (the Spreewaldring, © OpenStreetMap contributors, ODbL), the same
 //! extract as PBF (`supervisor/tests/data`), and the same roads as OpenDRIVE.
 
-use std::{fs, path::Path};
+use std::{fs, path::Path, process::Stdio};
 
-use crate::common::{Workplace, sumo_program, text, tool};
+use crate::common::{Workplace, sumo_program, text, tool, until};
 use caraware::install::Install;
+use rustix::process::{Pid, Signal, kill_process};
 
 const TRAFFIC: [&str; 4] = ["--duration-s", "60", "--demand", "20"];
 /// The extract of SUMO's wheel, packed.
@@ -18,6 +19,30 @@ const MAP_FILES: [&str; 6] = [
     "pedestrian.rou.xml",
     "city.sumocfg",
 ];
+
+#[test]
+fn an_import_that_is_interrupted_leaves_nothing() {
+    let workplace = Workplace::new();
+    for (directory, is_there) in [("new", false), ("empty", true)] {
+        let place = workplace.path().join(directory);
+        if is_there {
+            fs::create_dir(&place).unwrap();
+        }
+        let mut command = workplace.command(&["import", PACKED, directory]);
+        let mut import = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        until(&mut import, "a file of the import", || {
+            place.join("city.net.xml").exists().then_some(())
+        });
+        kill_process(Pid::from_child(&import), Signal::INT).unwrap();
+        assert_eq!(import.wait().unwrap().code(), Some(130));
+        let left =
+            fs::read_dir(&place).map(|entries| entries.flatten().map(|entry| entry.file_name()).collect::<Vec<_>>());
+        match is_there {
+            true => assert!(left.unwrap().is_empty()),
+            false => assert!(left.is_err(), "{left:?}"),
+        }
+    }
+}
 
 #[test]
 fn a_quarter_of_openstreetmap_and_its_roads_in_opendrive_become_scenarios() {

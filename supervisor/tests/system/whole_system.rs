@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeSet,
     io::{BufRead as _, BufReader},
-    path::Path,
+    path::{Path, PathBuf},
     process::{Child, Stdio},
     time::{Duration, Instant},
 };
@@ -392,6 +392,81 @@ fn a_closed_terminal_ends_the_run_with_a_checkpoint_and_a_report() {
     run.signal(Signal::HUP);
     assert_eq!(run.0.wait().unwrap().code(), Some(130));
     assert_eq!(workplace.report("hung")["result"], "interrupted");
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn the_runtime_directory_of_a_killed_run_can_be_removed() {
+    let workplace = Workplace::new();
+    let made = workplace.path().join("made");
+    let command = |arguments: &[&str]| {
+        let mut command = workplace.command(arguments);
+        command
+            .env("CARAWARE_RUNTIME_DIR", &made)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null());
+        command
+    };
+    let endless = ["--set", "episode.training_episodes=100000"];
+    let simulate = small("simulate", "killed", &[&QUIET[..], &endless].concat());
+    let mut run = command(&simulate).spawn().unwrap();
+    let log = workplace.path().join("runs/killed/logs/sensor-daemon.log");
+    eventually("a process of the run", || log.exists().then_some(()));
+    run.kill().unwrap();
+    run.wait().unwrap();
+    let here = workplace.path().to_string_lossy().into_owned();
+    eventually("the children end with the supervisor", || {
+        (!command_lines().iter().any(|line| line.contains(&here))).then_some(())
+    });
+    assert!(made.is_dir());
+    assert!(command(&["doctor", "--clean"]).status().unwrap().success());
+    assert!(!made.exists());
+}
+
+/// The directory of a run that is being prepared, and the process that prepares it.
+fn prepared_directory(workplace: &Workplace) -> (PathBuf, Pid) {
+    let files = |directory: &Path| std::fs::read_dir(directory).into_iter().flatten().flatten();
+    eventually("a marked directory", || {
+        let marks = files(&workplace.path().join("runs")).flat_map(|run| files(&run.path()).collect::<Vec<_>>());
+        marks.map(|file| file.path()).find_map(|path| {
+            let pid = path.file_name()?.to_str()?.strip_prefix(".preparing-")?.parse().ok()?;
+            Some((path.parent()?.to_owned(), Pid::from_raw(pid)?))
+        })
+    })
+}
+
+#[test]
+fn a_run_that_is_interrupted_while_it_is_prepared_leaves_nothing() {
+    let workplace = Workplace::new();
+    for (name, signal) in [("named", Signal::INT), ("ended", Signal::TERM)] {
+        let is_interrupted_in_time = |attempt: u32| {
+            let name = format!("{name}-{attempt}");
+            let mut run = Background::start(&workplace, &small("train", &name, &QUIET));
+            let (directory, pid) = prepared_directory(&workplace);
+            assert_eq!(pid, Pid::from_child(&run.0));
+            run.signal(signal);
+            assert_eq!(run.0.wait().unwrap().code(), Some(130));
+            // A run that was prepared meanwhile has a report.
+            let is_late = directory.join("report.json").exists();
+            assert!(is_late || !directory.exists(), "{}", directory.display());
+            workplace.assert_nothing_left();
+            std::fs::remove_dir_all(workplace.path().join("runs")).unwrap();
+            !is_late
+        };
+        assert!((0..5).any(is_interrupted_in_time), "each run was prepared too fast");
+    }
+    // One that was killed is made again by its wrapper, also if the user has not named it.
+    let unnamed = [&["train", "town", "--restart"][..], &SMALL, &QUIET].concat();
+    let mut run = Background::start(&workplace, &unnamed);
+    let (directory, pid) = prepared_directory(&workplace);
+    kill_process(pid, Signal::KILL).unwrap();
+    assert!(run.0.wait().unwrap().success());
+    let runs: Vec<_> = std::fs::read_dir(workplace.path().join("runs"))
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path())
+        .collect();
+    assert_eq!(runs, [directory]);
     workplace.assert_nothing_left();
 }
 
