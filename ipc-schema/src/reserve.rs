@@ -93,6 +93,19 @@ fn path(memory: &SharedMemory) -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("{}reserve", memory.prefix))
 }
 
+/// Frees the reserve of a run that has ended. A program that watched it keeps the file open, and with it would keep the memory.
+pub(crate) fn release(memory: &SharedMemory) {
+    let released = OpenOptions::new()
+        .write(true)
+        .open(path(memory))
+        .and_then(|file| file.set_len(0));
+    if let Err(error) = released
+        && error.kind() != io::ErrorKind::NotFound
+    {
+        tracing::debug!(%error, "the reserve of shared memory is not freed");
+    }
+}
+
 /// True if `file` is the reserve, which is empty once all of it is in use.
 pub(crate) fn is_reserve(memory: &SharedMemory, file: &Path) -> bool {
     file == path(memory)

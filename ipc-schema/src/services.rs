@@ -155,6 +155,7 @@ fn has_been_removed(directory: &File, path: &Path) -> bool {
 }
 
 fn remove_shared(memory: &SharedMemory) {
+    reserve::release(memory);
     for path in reserve::files(memory) {
         if let Err(error) = std::fs::remove_file(&path)
             && error.kind() != ErrorKind::NotFound

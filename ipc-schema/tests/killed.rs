@@ -19,6 +19,7 @@ use ipc_schema::{
     membership::{INCARNATION, RunMembership},
     ports::{BoardReader, RosterWriter},
     process::Process,
+    reserve,
     run::RunFile,
     services::{self, Channel, ServiceHolder},
 };
@@ -205,4 +206,16 @@ fn a_file_without_a_size_is_removed_if_its_creator_is_dead() {
     for path in files(&run) {
         std::fs::remove_file(path).unwrap();
     }
+}
+
+#[test]
+fn the_reserve_of_a_run_that_is_removed_is_freed_though_it_is_open() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = common::run_in(directory.path(), "reserve", common::town());
+    reserve::create(&run).unwrap();
+    let [path] = &files(&run)[..] else { panic!("one file") };
+    let held = File::open(path).unwrap();
+    assert!(held.metadata().unwrap().len() > 0);
+    services::remove_files(&run.shared_memory);
+    assert_eq!(held.metadata().unwrap().len(), 0);
 }
