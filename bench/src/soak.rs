@@ -12,7 +12,7 @@ use caraware::{failure::Exit, install};
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
-use super::{BenchOptions, BenchReport, ReportTable, free_port, sides::BenchDirectory};
+use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, free_port, sides::BenchDirectory};
 use crate::{
     quiet::QuietPlace,
     target::{CountedMemory, Target, resources, signal},
@@ -96,9 +96,9 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "Memory, handles and logs of a long run",
         format!(
             "The town with messages between vehicles, at full speed without end, {VIEWERS} viewers that count frames, {handovers} handovers \
-             after an update or at once in turn ({refused} more were refused), watched for {:.1} h. The memory is that which belongs to a process alone (RssAnon). Growth \
-             is the median of the slopes between all pairs of samples of one process, those of the first {:.0} % of its life left out; first \
-             and last are medians of a tenth of the samples.",
+             after an update or at once in turn ({refused} more were refused), watched for {:.1} h. The memory is that \
+             which belongs to a process alone (RssAnon). Growth is the median of the slopes between all pairs of samples of one process, \
+             those of the first {:.0} % of its life left out; first and last are medians of a tenth of the samples.",
             time.as_secs_f64() / 3600.0,
             100.0 * FILLING
         ),
@@ -198,9 +198,9 @@ impl Growth {
         let values: Vec<f64> = counted.iter().flatten().map(|(_, value)| *value).collect();
         let tenth = values.len().div_ceil(10);
         Self {
-            first: median(values.iter().take(tenth).copied()),
-            last: median(values.iter().rev().take(tenth).copied()),
-            per_h: Some(median(slopes)).filter(|slope| slope.is_finite()).unwrap_or(0.0),
+            first: median(values.iter().take(tenth).copied()).unwrap_or(f64::NAN),
+            last: median(values.iter().rev().take(tenth).copied()).unwrap_or(f64::NAN),
+            per_h: median(slopes).unwrap_or(0.0),
         }
     }
 }
@@ -215,14 +215,9 @@ fn without_filling(life: &[(f64, f64)]) -> Vec<(f64, f64)> {
     life.iter().copied().filter(|(at_h, _)| *at_h >= filled_h).collect()
 }
 
-/// The median, not a number if there is nothing.
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    let middle = values.len() / 2;
-    match values.is_empty() {
-        true => f64::NAN,
-        false => *values.select_nth_unstable_by(middle, f64::total_cmp).1,
-    }
+/// `None` if there is no value.
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    MedianSpread::of(values).ok().map(|spread| spread.median)
 }
 
 /// The run that is watched, and its viewers. Dropping it ends them.
