@@ -26,12 +26,45 @@ const REMOVALS: usize = 20;
 /// Pause between two of them.
 const PAUSE: Duration = Duration::from_millis(50);
 
+/// A thread that handles the signals that ask this program to end. Dropping it waits until the last one has been handled.
+#[derive(Debug)]
+pub struct SignalThread {
+    handle: Handle,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl SignalThread {
+    fn start(mut handle_signal: impl FnMut(i32) + Send + 'static) -> Result<Self, Exit> {
+        let failed = |error: &std::io::Error| Exit::run(format!("cannot watch signals: {error}"), "");
+        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).map_err(|error| failed(&error))?;
+        let handle = signals.handle();
+        let thread = std::thread::Builder::new()
+            .name("interruption".into())
+            .spawn(move || signals.forever().for_each(&mut handle_signal))
+            .map_err(|error| failed(&error))?;
+        Ok(Self {
+            handle,
+            thread: Some(thread),
+        })
+    }
+}
+
+impl Drop for SignalThread {
+    fn drop(&mut self) {
+        self.handle.close();
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::warn!("the thread that handles signals has failed");
+        }
+    }
+}
+
 /// Notes signals until it is dropped. A second one ends the program at once.
 #[derive(Debug)]
 pub struct InterruptionWatch {
     is_requested: Arc<AtomicBool>,
-    handle: Handle,
-    thread: Option<JoinHandle<()>>,
+    _thread: SignalThread,
 }
 
 impl InterruptionWatch {
@@ -42,18 +75,16 @@ impl InterruptionWatch {
     pub fn start() -> Result<Self, Exit> {
         let is_requested = Arc::new(AtomicBool::new(false));
         let seen = Arc::clone(&is_requested);
-        let note = move |signal| {
-            if seen.swap(true, Ordering::Relaxed)
-                && let Err(error) = emulate_default_handler(signal)
-            {
+        let thread = SignalThread::start(move |signal| {
+            if !seen.swap(true, Ordering::Relaxed) {
+                notice("stopping once this step of the preparation is done (press Ctrl-C again to kill)");
+            } else if let Err(error) = emulate_default_handler(signal) {
                 tracing::warn!(%error, "the signal {signal} is ignored");
             }
-        };
-        let (handle, thread) = on_signal(note)?;
+        })?;
         Ok(Self {
             is_requested,
-            handle,
-            thread: Some(thread),
+            _thread: thread,
         })
     }
 
@@ -75,25 +106,14 @@ impl InterruptionWatch {
     }
 }
 
-impl Drop for InterruptionWatch {
-    fn drop(&mut self) {
-        self.handle.close();
-        if let Some(thread) = self.thread.take()
-            && thread.join().is_err()
-        {
-            tracing::warn!("the thread that watches signals has failed");
-        }
-    }
-}
-
 /// From now on a signal removes all that is in `directory`, which was empty, and ends the program; the directory itself stays if it
 /// `was_there`. Drop the returned value when the directory is complete.
 ///
 /// # Errors
 /// Signals cannot be watched.
-pub fn remove_when_interrupted(directory: &Path, was_there: bool) -> Result<impl Drop + use<>, Exit> {
+pub fn remove_when_interrupted(directory: &Path, was_there: bool) -> Result<SignalThread, Exit> {
     let directory = directory.to_owned();
-    let (handle, _) = on_signal(move |_| {
+    SignalThread::start(move |_| {
         let removed = (0..REMOVALS).any(|attempt| {
             if attempt > 0 {
                 std::thread::park_timeout(PAUSE);
@@ -112,16 +132,7 @@ pub fn remove_when_interrupted(directory: &Path, was_there: bool) -> Result<impl
         };
         notice(&format!("interrupted: {what} ({})", directory.display()));
         std::process::exit(INTERRUPTED.into());
-    })?;
-    Ok(ClosedWhenDropped(handle))
-}
-
-struct ClosedWhenDropped(Handle);
-
-impl Drop for ClosedWhenDropped {
-    fn drop(&mut self) {
-        self.0.close();
-    }
+    })
 }
 
 fn remove(path: &Path) {
@@ -132,16 +143,4 @@ fn remove(path: &Path) {
     if let Err(error) = removed {
         tracing::debug!(%error, path = %path.display(), "cannot remove");
     }
-}
-
-/// Calls `action` with each signal that asks this program to end, on a thread, until the handle is closed.
-fn on_signal(mut action: impl FnMut(i32) + Send + 'static) -> Result<(Handle, JoinHandle<()>), Exit> {
-    let failed = |error: &std::io::Error| Exit::run(format!("cannot watch signals: {error}"), "");
-    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).map_err(|error| failed(&error))?;
-    let handle = signals.handle();
-    let thread = std::thread::Builder::new()
-        .name("interruption".into())
-        .spawn(move || signals.forever().for_each(&mut action))
-        .map_err(|error| failed(&error))?;
-    Ok((handle, thread))
 }

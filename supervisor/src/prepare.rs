@@ -212,13 +212,35 @@ fn prepare_new(
     let viewer = ViewerRequest::of(args, &config.fanout)?;
     maps::locate(&mut config.curriculum)?;
     let command_logs = read_command_logs(args.commands.as_deref(), config.run.envs)?;
+    prepare_in_new_directory(args, label, install, viewer, |run_dir, install| {
+        let assembled = assemble(run_dir, mode, config, install, named, scenario_map)?;
+        write_command_logs(&run_dir.path, &command_logs)?;
+        Ok(assembled)
+    })
+}
+
+/// Creates the directory of a run, which `assemble` fills. Without success, or if this program is asked to end meanwhile, it removes the
+/// directory.
+///
+/// # Errors
+/// Those of `assemble`, the directory cannot be created, or this program is asked to end.
+pub(crate) fn prepare_in_new_directory(
+    args: &RunArgs,
+    label: &str,
+    install: Install,
+    viewer: Option<ViewerRequest>,
+    assemble: impl FnOnce(&RunDirectory, &Install) -> Result<(RunFile, RunClaim), Exit>,
+) -> Result<PreparedRun, Exit> {
     registry::sweep();
-    // From here on the run has a directory.
     let interruption = InterruptionWatch::start()?;
     let run_dir = create_run_dir(args, label)?;
-    let assembled = assemble(&run_dir, mode, config, &install, named, scenario_map)
-        .and_then(|assembled| write_command_logs(&run_dir.path, &command_logs).map(|()| assembled));
-    let (run, claim) = interruption.outcome(assembled).inspect_err(|_| run_dir.remove())?;
+    let assembled = interruption.outcome(assemble(&run_dir, &install));
+    let (run, claim) = assembled.inspect_err(|_| {
+        // No process has started, so the directory holds nothing of use.
+        if let Err(error) = std::fs::remove_dir_all(&run_dir.path) {
+            tracing::warn!(%error, "cannot remove the run directory");
+        }
+    })?;
     Ok(PreparedRun {
         run,
         install,
@@ -378,17 +400,8 @@ pub(crate) struct RunDirectory {
     pub(crate) path: PathBuf,
 }
 
-impl RunDirectory {
-    /// Removes a directory that holds nothing of use, because no process has started.
-    pub(crate) fn remove(&self) {
-        if let Err(error) = std::fs::remove_dir_all(&self.path) {
-            tracing::warn!(%error, "cannot remove the run directory");
-        }
-    }
-}
-
 /// Creates `runs/<name>`, which must not exist: the given name, or the label with the first free number.
-pub(crate) fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
+fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
     let runs = std::path::absolute(&args.runs).map_err(|error| Exit::io("resolve", &args.runs, &error))?;
     std::fs::create_dir_all(&runs).map_err(|error| Exit::io("create", &runs, &error))?;
     if let Some(name) = &args.name {

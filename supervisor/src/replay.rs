@@ -17,10 +17,9 @@ use crate::{
     config::{self, LayeredSettings},
     failure::Exit,
     install::Install,
-    interruption::InterruptionWatch,
-    prepare::{PreparedRun, RunDirectory, create_run_dir, reserve_shared_memory},
+    prepare::{PreparedRun, RunDirectory, prepare_in_new_directory, reserve_shared_memory},
     record::recording_path,
-    registry::{self, RunClaim},
+    registry::RunClaim,
     remote, resume, system_limits,
     view::ViewerRequest,
 };
@@ -60,21 +59,13 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
         runs: args.runs.clone(),
         viewer: args.viewer,
         credentials: args.credentials.clone(),
+        quiet: args.quiet,
         ..RunArgs::default()
     };
     let viewer = ViewerRequest::of(&run_args, &config.fanout)?;
-    registry::sweep();
-    let interruption = InterruptionWatch::start()?;
-    let run_dir = create_run_dir(&run_args, &format!("{}-replay", old.name))?;
-    let assembled = assemble(args, mode, &run_dir, config, old, &recording, &install);
-    let (run, claim) = interruption.outcome(assembled).inspect_err(|_| run_dir.remove())?;
-    Ok(PreparedRun {
-        run,
-        install,
-        claim,
-        quiet: args.quiet,
-        viewer,
-        interruption,
+    let label = format!("{}-replay", old.name);
+    prepare_in_new_directory(&run_args, &label, install, viewer, |run_dir, install| {
+        assemble(args, mode, run_dir, config, old, &recording, install)
     })
 }
 
