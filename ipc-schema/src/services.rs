@@ -176,10 +176,10 @@ pub fn remove_files(memory: &SharedMemory) {
     remove_shared(memory);
 }
 
-/// Removes files of a run in shared memory that their creators were killed before giving a size.
+/// Removes files of a run in shared memory whose creators were killed before they had set the size.
 ///
-/// iceoryx2 creates a file and then sets its size. Who opens it waits for that: in version 0.10 for ever, if it may read the files of
-/// others (`root` may), because the time limit of the wait is not asked there. Without the file the wait is over.
+/// iceoryx2 creates a file and then sets its size. A process that opens the file waits for the size. In version 0.10 that wait has no time
+/// limit if the process runs as `root`, which may read a file whose permissions are not set yet. It ends when the file is removed.
 pub fn remove_unfinished(memory: &SharedMemory) {
     let is_unfinished = |path: &Path| {
         path.symlink_metadata()
