@@ -22,7 +22,7 @@ use crate::{
     radar::{RadarDetection, RadarScan},
     section::{SectionSpec, WireElement, numpy_type},
     sensor::{SENSORS, SensorKind},
-    traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
+    traffic::{RoutePoint, SignalMeta, TrafficState, VEHICLE_CLASSES, VehicleMeta},
     world::{HeroView, SubStep, VehicleState},
 };
 
@@ -143,6 +143,7 @@ pub fn table() -> Vec<TypeLayout> {
             rear_overhang_m,
             whole_length_m,
             trailing,
+            class,
             vehicle,
             kind,
             signals,
@@ -503,11 +504,12 @@ fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
 /// A row has no form in JSON.
 pub fn json() -> Result<String, serde_json::Error> {
     Ok(format!(
-        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"alignment\": {ALIGNMENT},\n  \"types\": {},\n  \"payloads\": {},\n  \"sensors\": {},\n  \"fields\": {}\n}}\n",
+        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"alignment\": {ALIGNMENT},\n  \"types\": {},\n  \"payloads\": {},\n  \"sensors\": {},\n  \"fields\": {},\n  \"vehicle_classes\": {}\n}}\n",
         lines(&table())?,
         lines(&payloads())?,
         lines(&sensors())?,
-        lines(&fields())?
+        lines(&fields())?,
+        lines(&VEHICLE_CLASSES)?
     ))
 }
 

@@ -102,6 +102,20 @@ pub const VEHICLE_CLASSES: [&str; 34] = [
     "ignoring",
 ];
 
+/// Place of a class in [`VEHICLE_CLASSES`]; an unknown one counts as "ignoring", SUMO's class without properties.
+#[must_use]
+pub fn class_number(name: &str) -> u16 {
+    let place = VEHICLE_CLASSES.iter().position(|class| *class == name);
+    place.unwrap_or(VEHICLE_CLASSES.len() - 1) as u16
+}
+
+/// The class of this number ([`VehicleState::class`](crate::world::VehicleState::class)); of a larger one "ignoring".
+#[must_use]
+pub fn class_name(number: u16) -> &'static str {
+    let last = VEHICLE_CLASSES.len() - 1;
+    VEHICLE_CLASSES[usize::from(number).min(last)]
+}
+
 /// Longest id that is carried as it is, as long as those that commands carry. Of a longer one its begin is carried, then
 /// [`CUT_MARK`] and the 16 digits of its hash, so that two ids stay different.
 pub const ID_BYTES: usize = 128;

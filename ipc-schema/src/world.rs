@@ -114,7 +114,9 @@ pub struct VehicleState {
     /// From the front to the end of the last body in a straight line, metres: SUMO's length.
     pub whole_length_m: f32,
     /// Trailing bodies behind this one that belong to the same vehicle and are in the message.
-    pub trailing: u32,
+    pub trailing: u16,
+    /// SUMO's vehicle class, as the place in [`crate::traffic::VEHICLE_CLASSES`]; of a trailing body that of its vehicle.
+    pub class: u16,
     /// Dense index within the episode; of a trailing body [`trailing_index`].
     pub vehicle: u32,
     /// A [`crate::traffic::Kind`].

@@ -8,7 +8,7 @@ use common::{LENGTH_M, Road, drive, frame, limits, meta, previewing, settings};
 use ipc_schema::{
     config,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
-    traffic::{Kind, MetaEvent, TrafficState, VehicleMeta},
+    traffic::{Kind, MetaEvent, TrafficState, VehicleMeta, class_name},
     world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState, trailing_index, vehicle_of},
 };
 use proptest::prelude::*;
@@ -406,8 +406,13 @@ fn trailing_bodies_follow_all_road_users_and_those_without_room_are_left_out() {
     for tick in 0..10 {
         let (trailing, states) = bodies(&mut mirror, tick, &[0, 1, 2, 3]);
         assert_eq!(trailing, [trailing_index(0, 1), trailing_index(2, 1)]);
-        let behind: Vec<u32> = states.iter().map(|state| state.trailing).collect();
+        let behind: Vec<u16> = states.iter().map(|state| state.trailing).collect();
         assert_eq!(behind, [1, 0, 1, 0, 0, 0]);
+        let classes: Vec<&str> = states.iter().map(|state| class_name(state.class)).collect();
+        assert_eq!(
+            classes,
+            ["trailer", "passenger", "trailer", "trailer", "trailer", "trailer"]
+        );
         assert_eq!(vehicle_of(trailing[1]), 2);
     }
     // When the first truck has left, the last one has its trailer, right behind it.

@@ -14,7 +14,7 @@ import sumo  # type: ignore[import-untyped]  # the wheel of SUMO has no stubs
 from caraware.data import Recording, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.nuscenes import VERSION
-from caraware.data.names import BODY_SHIFT, Kind, RoadUsers
+from caraware.data.names import BODY_SHIFT, Kind, RoadUsers, vehicle_class
 from caraware.data.recording import Array
 from caraware.ipc.image import split_planes
 from nuscenes.nuscenes import NuScenes
@@ -61,6 +61,7 @@ SETTINGS = {
     "camera.vehicles": 4,
     "record.channels": '["world", "observation", "pointcloud", "image", "traffic-meta"]',
 }
+CLASSES = {"semi": "trailer", "bendy": "bus", "tram": "tram", "car": "passenger"}
 TRAILING = {"semi": 1, "bendy": 1, "tram": 2, "car": 0}
 """Trailing bodies of each vehicle."""
 
@@ -107,6 +108,7 @@ def test_a_world_has_every_body_behind_its_road_users(worlds: dict[int, Array], 
         ]
         assert [(int(body["vehicle"]), int(body["id_hash"])) for body in trailing] == expected
         seen |= {users.body_name(state) for state in states}
+        assert all(vehicle_class(state) == CLASSES[users.of(state["id_hash"]).id] for state in states)
     assert seen == {"semi", "semi/1", "bendy", "bendy/1", "tram", "tram/1", "tram/2", "car"}
 
 

@@ -14,7 +14,7 @@ import pytest
 from caraware.data import RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.oxts import Geodesy
-from caraware.data.names import RoadUsers
+from caraware.data.names import RoadUsers, vehicle_class
 from caraware.data.recording import Array
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.image import split_planes
@@ -194,6 +194,7 @@ def test_labels_are_the_boxes_of_the_world_and_hold_its_points(frames: list[Comp
             assert np.all((-height - 0.25 < in_box[:, 1]) & (in_box[:, 1] < 0.25))
             on_boxes += len(on_it)
             classes.add((label.type, users.of(state["id_hash"]).vehicle_class))
+            assert vehicle_class(state) == users.of(state["id_hash"]).vehicle_class
             turned.add(int(label.rotation_y // (np.pi / 2)))
             if int(state["vehicle"]) not in seen:
                 assert (label.truncated, label.occluded) == (-1, 3) and label.box.tolist() == [-1] * 4

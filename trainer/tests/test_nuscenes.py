@@ -13,7 +13,7 @@ from caraware.data import Recording, RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.nuscenes import VERSION
 from caraware.data.export.scans import quaternion
-from caraware.data.names import RoadUsers
+from caraware.data.names import RoadUsers, vehicle_class
 from caraware.data.recording import Array
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.pointcloud import rotation
@@ -176,6 +176,7 @@ def test_boxes_are_the_road_users_and_hold_their_points(
                 attribute = devkit.get("attribute", row["attribute_tokens"][0])["name"]
                 assert attribute.startswith(box.name.split(".")[0].replace("human", "pedestrian"))
                 names.add((box.name, users.of(state["id_hash"]).vehicle_class))
+                assert vehicle_class(state) == users.of(state["id_hash"]).vehicle_class
                 velocity = devkit.box_velocity(annotation)
                 if not np.isnan(velocity).any():
                     # The mean from the key frame before to the one behind, at their simulated times.

@@ -12,13 +12,15 @@ use ipc_schema::{
     config::{Config, RoadsideService, RoadsideUnitConfig, V2xAwareness, V2xListing},
     header::{FIRST_OF_EPISODE, MessageHeader},
     neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
-    traffic::Kind,
+    traffic::{Kind, class_number},
     world::VehicleState,
 };
 use sim_core::scene::{Prism, Road, Scene, SolidClass};
 use v2x::{
     exchange::{MessageExchange, SlotMeasurement},
     message::{
+        StationKind,
+        cam::Cam,
         cpm::{Cpm, CpmOrigin},
         geonetworking,
         roadside_cam::RoadsideCam,
@@ -244,6 +246,48 @@ fn basic_safety_messages_take_the_place_of_cams() {
     }
     // 37 bytes of core data, three of their frame, four of the short header, and what is around them on air.
     assert_eq!(blocks[2].radio[0][3], 37 + 3 + 4 + 38);
+}
+
+#[test]
+fn stations_name_the_kind_of_vehicle_that_they_are() {
+    let mut config = config();
+    config.v2x.pcap = true;
+    let expected = [
+        ("passenger", 5),
+        ("delivery", 7),
+        ("truck", 8),
+        ("trailer", 8),
+        ("bus", 6),
+        ("tram", 11),
+        ("motorcycle", 4),
+        ("moped", 3),
+        ("bicycle", 2),
+        ("scooter", 12),
+        ("emergency", 10),
+        ("ship", 0),
+    ];
+    let cars: Vec<VehicleState> = (0..)
+        .zip(expected)
+        .map(|(number, (class, _))| VehicleState {
+            class: class_number(class),
+            ..car(number, 40.0 * f64::from(number), 0.0, 10.0)
+        })
+        .collect();
+    let (_, exchange) = run(&config, Vec::new(), &cars, 1);
+    let sent = |number: usize| {
+        let station = station_id(cars[number].id_hash);
+        let packets = exchange.on_air().iter();
+        let heads = packets.map(|sent| geonetworking::decode(&sent.packet).unwrap());
+        let mut cams = heads.filter_map(|(head, message)| Some((head.kind, Cam::decode(message).ok()?)));
+        cams.find(|(_, cam)| cam.station == station).unwrap()
+    };
+    for (number, (class, kind)) in expected.into_iter().enumerate() {
+        let (head, cam) = sent(number);
+        assert_eq!((head, cam.kind.0), (kind, kind), "{class}");
+    }
+    // The class names no kind: the length decides.
+    assert_eq!(StationKind::of_vehicle("ignoring", 7.1), StationKind::HEAVY_TRUCK);
+    assert_eq!(StationKind::of_vehicle("custom1", 4.0), StationKind::PASSENGER_CAR);
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Images of single bodies in closed form.
 
+use ipc_schema::traffic::class_number;
 use sensor_daemon::sensors::camera::{SKY_INSTANCE, SemanticLabel};
 
 use crate::{
@@ -48,8 +49,9 @@ fn a_wall_square_to_the_camera_has_one_depth() {
 
 #[test]
 fn each_kind_of_road_user_has_its_class_and_is_white() {
-    use SemanticLabel::{Bicycle, Bus, Car, Motorcycle, Person, Truck};
-    let of = |length_m: f32, width_m: f32, height_m: f32, kind: Kind| VehicleState {
+    use SemanticLabel::{Bicycle, Bus, Car, Dynamic, Motorcycle, Person, Train, Truck};
+    let of = |class: &str, [length_m, width_m, height_m]: [f32; 3], kind: Kind| VehicleState {
+        class: class_number(class),
         length_m,
         width_m,
         height_m,
@@ -57,14 +59,27 @@ fn each_kind_of_road_user_has_its_class_and_is_white() {
         ..car(1, 20.0, 0.0, 0.0)
     };
     for (state, expected) in [
-        (of(5.0, 1.8, 1.5, Kind::Other), Car),
-        (of(6.5, 2.16, 2.86, Kind::Other), Truck),
-        (of(7.1, 2.4, 2.4, Kind::Other), Truck),
-        (of(16.5, 2.55, 4.0, Kind::Other), Truck),
-        (of(12.0, 2.5, 3.4, Kind::Other), Bus),
-        (of(2.2, 0.9, 1.5, Kind::Other), Motorcycle),
-        (of(1.6, 0.65, 1.7, Kind::Other), Bicycle),
-        (of(0.5, 0.5, 1.7, Kind::Person), Person),
+        (of("passenger", [5.0, 1.8, 1.5], Kind::Other), Car),
+        (of("delivery", [6.5, 2.16, 2.86], Kind::Other), Truck),
+        (of("truck", [5.8, 2.2, 2.0], Kind::Other), Truck),
+        (of("taxi", [6.2, 2.0, 2.2], Kind::Other), Car),
+        (of("trailer", [16.5, 2.55, 4.0], Kind::Other), Truck),
+        (of("trailer", [9.0, 2.55, 3.5], Kind::Trailing), Truck),
+        (of("bus", [8.0, 2.5, 3.4], Kind::Other), Bus),
+        (of("coach", [14.0, 2.6, 4.0], Kind::Other), Bus),
+        (of("tram", [22.0, 2.4, 3.2], Kind::Other), Train),
+        (of("rail_fast", [25.0, 2.95, 3.6], Kind::Trailing), Train),
+        (of("moped", [1.8, 0.8, 1.7], Kind::Other), Motorcycle),
+        (of("bicycle", [2.0, 0.65, 1.7], Kind::Other), Bicycle),
+        (of("ship", [17.0, 4.0, 4.0], Kind::Other), Dynamic),
+        (of("wheelchair", [0.8, 0.7, 1.4], Kind::Other), Person),
+        (of("pedestrian", [0.5, 0.5, 1.7], Kind::Person), Person),
+        // Types of vehicles whose class names no kind: their size decides.
+        (of("ignoring", [7.1, 2.4, 2.4], Kind::Other), Truck),
+        (of("passenger", [16.5, 2.55, 4.0], Kind::Other), Truck),
+        (of("passenger", [12.0, 2.5, 3.4], Kind::Other), Bus),
+        (of("custom1", [2.2, 0.9, 1.5], Kind::Other), Motorcycle),
+        (of("passenger", [1.6, 0.65, 1.7], Kind::Other), Bicycle),
     ] {
         let camera = CameraModel::new(
             &params(100, 100, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),

@@ -490,7 +490,7 @@ impl Mirror {
                 continue;
             };
             let (bodies, rest) = std::mem::take(&mut trailing).split_at_mut(count);
-            states[row].trailing = count as u32;
+            states[row].trailing = count as u16;
             let steps = &mut rows[row * per_tick..(row + 1) * per_tick];
             chain.write_tick(&mut states[row], steps, tick_s, bodies);
             trailing = rest;

@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     config::HeroDriver,
-    traffic::{DISCONTINUOUS, Kind, TrafficState, VehicleMeta},
+    traffic::{DISCONTINUOUS, Kind, TrafficState, VehicleMeta, class_number},
     world::{APPEARED, GUIDED, RESYNCHRONISED, SubStep, VehicleState},
 };
 
@@ -76,6 +76,8 @@ pub struct RoadUser {
     suites: u32,
     /// Index of its model in the [`ModelCatalogue`].
     model: u32,
+    /// SUMO's vehicle class, by its number.
+    class: u16,
     dimensions: VehicleDimensions,
     /// Steering-wheel angle by road-wheel angle; 0 for a person.
     steering_ratio: f32,
@@ -121,6 +123,7 @@ impl RoadUser {
             id_hash: meta.id_hash,
             suites: settings.suites.as_ref().map_or(0, |rules| rules.flags_of(meta)),
             model,
+            class: class_number(&meta.class_text()),
             dimensions,
             steering_ratio: match mover {
                 Mover::Person(_) => 0.0,
@@ -529,7 +532,7 @@ impl RoadUser {
         *out = VehicleState::default();
         out.id_hash = self.id_hash;
         out.vehicle = self.now.vehicle;
-        out.kind = self.now.kind;
+        (out.kind, out.class) = (self.now.kind, self.class);
         out.signals = self.now.signals;
         out.steering_ratio = self.steering_ratio;
         out.length_m = length_m as f32;

@@ -2,6 +2,7 @@
 
 use ipc_schema::{
     config::{RoadsideService, V2xAwareness, V2xConfig, V2xInclusion, V2xListing},
+    traffic::class_name,
     world::VehicleState,
 };
 use sim_core::geodesy::Projection;
@@ -29,8 +30,6 @@ use crate::{
     },
 };
 
-/// Length from which a vehicle calls itself a lorry, metres.
-const TRUCK_LENGTH_M: f64 = 7.0;
 /// Most objects in a message of an edge service: some 1500 bytes, as many as a frame may have. The others are due at the next tick.
 const MOST_FUSED: usize = 50;
 /// Bit of the number of a message of the services behind the first two.
@@ -252,13 +251,13 @@ impl StationTurn<'_> {
         let Some(own) = &tick.slots[self.radio.slot].own else {
             return;
         };
-        let size = size_of(&tick.states[self.radio.antenna.row as usize]);
+        let state = &tick.states[self.radio.antenna.row as usize];
+        let size = size_of(state);
         let composer = MessageComposer {
             station: self.station.station,
-            kind: match size.length_m {
-                _ if self.station.is_person => StationKind::PEDESTRIAN,
-                length_m if length_m > TRUCK_LENGTH_M => StationKind::HEAVY_TRUCK,
-                _ => StationKind::PASSENGER_CAR,
+            kind: match self.station.is_person {
+                true => StationKind::PEDESTRIAN,
+                false => StationKind::of_vehicle(class_name(state.class), size.length_m),
             },
             now_ns: tick.now_ns,
             own,

@@ -9,17 +9,56 @@ use super::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StationKind(pub u8);
 
+/// A vehicle of a class that vehicles of any size have is a lorry if it is longer, metres.
+const TRUCK_LENGTH_M: f64 = 7.0;
+
 impl StationKind {
+    /// None of the other kinds, such as a ship.
+    pub const UNKNOWN: Self = Self(0);
+    /// A person on foot or in a wheelchair.
+    pub const PEDESTRIAN: Self = Self(1);
+    /// A bicycle.
+    pub const CYCLIST: Self = Self(2);
+    /// A moped.
+    pub const MOPED: Self = Self(3);
+    /// A motorcycle.
+    pub const MOTORCYCLE: Self = Self(4);
     /// A car.
     pub const PASSENGER_CAR: Self = Self(5);
     /// A bus.
     pub const BUS: Self = Self(6);
-    /// A lorry.
+    /// A van.
+    pub const LIGHT_TRUCK: Self = Self(7);
+    /// A lorry, with its trailers.
     pub const HEAVY_TRUCK: Self = Self(8);
-    /// A person on foot.
-    pub const PEDESTRIAN: Self = Self(1);
+    /// A vehicle with a task of its own, such as an ambulance.
+    pub const SPECIAL_VEHICLE: Self = Self(10);
+    /// A tram or a train.
+    pub const TRAM: Self = Self(11);
+    /// An electric scooter.
+    pub const LIGHT_VRU_VEHICLE: Self = Self(12);
     /// A roadside unit.
     pub const ROADSIDE_UNIT: Self = Self(15);
+
+    /// The kind of a vehicle of this class of SUMO's and this length, metres.
+    #[must_use]
+    pub fn of_vehicle(class: &str, length_m: f64) -> Self {
+        match class {
+            "bus" | "coach" => Self::BUS,
+            "delivery" => Self::LIGHT_TRUCK,
+            "truck" | "trailer" => Self::HEAVY_TRUCK,
+            "emergency" => Self::SPECIAL_VEHICLE,
+            "tram" | "rail_urban" | "rail" | "rail_electric" | "rail_fast" | "subway" => Self::TRAM,
+            "motorcycle" => Self::MOTORCYCLE,
+            "moped" => Self::MOPED,
+            "bicycle" => Self::CYCLIST,
+            "scooter" => Self::LIGHT_VRU_VEHICLE,
+            "pedestrian" | "wheelchair" => Self::PEDESTRIAN,
+            "ship" | "container" | "cable_car" | "aircraft" | "drone" => Self::UNKNOWN,
+            _ if length_m > TRUCK_LENGTH_M => Self::HEAVY_TRUCK,
+            _ => Self::PASSENGER_CAR,
+        }
+    }
 }
 
 /// Latitude and longitude in 0.1 microdegrees, altitude in centimetres; `None` = unavailable.

@@ -21,6 +21,7 @@ ROAD_USERS: dict[int, tuple[str, int]] = {
     26: ("car", int(TAG_COLORS[_VEHICLE])),
     27: ("truck", int(TAG_COLORS[_VEHICLE])),
     28: ("bus", int(TAG_COLORS[_VEHICLE])),
+    31: ("train", int(TAG_COLORS[_VEHICLE])),
     32: ("motorcycle", int(TAG_COLORS[_TWO_WHEELER])),
     33: ("bicycle", int(TAG_COLORS[_TWO_WHEELER])),
 }
@@ -29,6 +30,7 @@ _OTHER = ("other", 0xFFFFFFFF)
 
 _LABEL_COLORS: dict[int, tuple[int, int, int]] = {
     4: (0, 0, 0),  # static
+    5: (111, 74, 0),  # dynamic
     7: (128, 64, 128),  # road
     8: (244, 35, 232),  # sidewalk
     10: (230, 150, 140),  # rail track
@@ -43,6 +45,7 @@ _LABEL_COLORS: dict[int, tuple[int, int, int]] = {
     26: (0, 0, 142),  # car
     27: (0, 0, 70),  # truck
     28: (0, 60, 100),  # bus
+    31: (0, 80, 100),  # train
     32: (0, 0, 230),  # motorcycle
     33: (119, 11, 32),  # bicycle
     # Classes that CityScapes counts as road, in colours of ours.

@@ -131,7 +131,7 @@ impl RoadUserBody {
         let is_two_wheeler = mover.word & 0xFF == Tag::TwoWheeler as u32;
         let label = match mover.is_person {
             true => SemanticLabel::Person,
-            false => SemanticLabel::of_vehicle(is_two_wheeler, length_m, mover.height_m),
+            false => SemanticLabel::of_vehicle(mover.class, is_two_wheeler, length_m, mover.height_m),
         };
         let part = |from: f64, to: f64, low: f64, high: f64| {
             let (rear, front) = (mover.rear_m + from * length_m, mover.rear_m + to * length_m);

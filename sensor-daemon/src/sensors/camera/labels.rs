@@ -1,6 +1,8 @@
 //! Semantic classes of an image, and their colours.
 
-use ipc_schema::pointcloud::Tag;
+use std::sync::LazyLock;
+
+use ipc_schema::{pointcloud::Tag, traffic::VEHICLE_CLASSES};
 
 /// Class of a pixel: the label ids of the CityScapes data set (M. Cordts et al., *The Cityscapes Dataset for Semantic Urban Scene
 /// Understanding*, CVPR 2016), and from 40 on classes that it counts as road.
@@ -9,6 +11,8 @@ use ipc_schema::pointcloud::Tag;
 pub enum SemanticLabel {
     /// Furniture of the street and loads: CityScapes' "static".
     Static = 4,
+    /// What moves and is no road vehicle, such as a ship or an aircraft: CityScapes' "dynamic".
+    Dynamic = 5,
     /// The carriageway.
     Road = 7,
     /// Where pedestrians walk.
@@ -37,6 +41,8 @@ pub enum SemanticLabel {
     Truck = 27,
     /// A bus.
     Bus = 28,
+    /// A tram or a train, with all its carriages.
+    Train = 31,
     /// A motorcycle with its rider.
     Motorcycle = 32,
     /// A bicycle with its rider.
@@ -70,9 +76,35 @@ impl SemanticLabel {
         }
     }
 
-    /// The class of a vehicle of this size, metres. A state of the traffic has no class, so lengths and heights of SUMO's vehicle
-    /// classes decide: bicycles are 1.6 m long and motorcycles 2.2 m, buses 12 m and longer, lorries and vans above 2.1 m tall.
-    pub(super) fn of_vehicle(is_two_wheeler: bool, length_m: f64, height_m: f64) -> Self {
+    /// The label of a vehicle of SUMO's class number `class`, with its length and height in metres. A class that vehicles of any kind have
+    /// leaves it to the size.
+    pub(super) fn of_vehicle(class: u16, is_two_wheeler: bool, length_m: f64, height_m: f64) -> Self {
+        static OF_CLASS: LazyLock<[Option<SemanticLabel>; VEHICLE_CLASSES.len()]> =
+            LazyLock::new(|| VEHICLE_CLASSES.map(SemanticLabel::of_class));
+        let of_class = OF_CLASS.get(usize::from(class)).copied().flatten();
+        of_class.unwrap_or_else(|| Self::of_size(is_two_wheeler, length_m, height_m))
+    }
+
+    /// The label of one of SUMO's vehicle classes, by the definitions of CityScapes, where trailers of lorries are lorries. `None` for
+    /// classes of vehicles that may be cars or lorries there: vans, whose cab and load may share one body or not; "passenger", which is also
+    /// the class of vehicles whose type names none; and classes that say who drives.
+    fn of_class(class: &str) -> Option<Self> {
+        Some(match class {
+            "taxi" => Self::Car,
+            "truck" | "trailer" => Self::Truck,
+            "bus" | "coach" => Self::Bus,
+            "tram" | "rail_urban" | "rail" | "rail_electric" | "rail_fast" | "subway" => Self::Train,
+            "motorcycle" | "moped" => Self::Motorcycle,
+            "bicycle" | "scooter" => Self::Bicycle,
+            "pedestrian" | "wheelchair" => Self::Person,
+            "ship" | "container" | "cable_car" | "aircraft" | "drone" => Self::Dynamic,
+            _ => return None,
+        })
+    }
+
+    /// The label of a vehicle of this size, metres, by the lengths and heights of SUMO's vehicle classes: bicycles are 1.6 m long and
+    /// motorcycles 2.2 m, buses 12 m and longer, lorries above 2.1 m tall.
+    fn of_size(is_two_wheeler: bool, length_m: f64, height_m: f64) -> Self {
         match is_two_wheeler {
             true if length_m < 1.9 => Self::Bicycle,
             true => Self::Motorcycle,
@@ -91,7 +123,7 @@ impl SemanticLabel {
             Self::Building => [0.58, 0.50, 0.43],
             Self::Wall => [0.50, 0.48, 0.45],
             Self::Barrier => [0.80, 0.35, 0.15],
-            Self::Static => [0.35, 0.35, 0.30],
+            Self::Static | Self::Dynamic => [0.35, 0.35, 0.30],
             Self::Pole => [0.45, 0.45, 0.47],
             Self::Vegetation => [0.16, 0.32, 0.12],
             Self::Terrain => [0.28, 0.38, 0.18],
@@ -100,6 +132,7 @@ impl SemanticLabel {
             Self::Car => [0.50, 0.50, 0.55],
             Self::Truck => [0.60, 0.58, 0.50],
             Self::Bus => [0.75, 0.55, 0.15],
+            Self::Train => [0.65, 0.20, 0.18],
             Self::Motorcycle => [0.25, 0.25, 0.30],
             Self::Bicycle => [0.30, 0.20, 0.20],
             Self::LaneMarking | Self::StopLine | Self::Crossing => [0.85, 0.85, 0.85],
@@ -107,8 +140,9 @@ impl SemanticLabel {
     }
 
     /// Every class.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 22] = [
         Self::Static,
+        Self::Dynamic,
         Self::Road,
         Self::Sidewalk,
         Self::RailTrack,
@@ -123,6 +157,7 @@ impl SemanticLabel {
         Self::Car,
         Self::Truck,
         Self::Bus,
+        Self::Train,
         Self::Motorcycle,
         Self::Bicycle,
         Self::LaneMarking,

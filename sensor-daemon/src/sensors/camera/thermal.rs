@@ -136,7 +136,7 @@ fn surface(label: SemanticLabel, air_k: f64, sun: f64) -> (f64, f64) {
         L::Sidewalk => (air_k + 1.0 + 14.0 * sun, 0.94),
         L::RailTrack => (air_k + 1.0 + 16.0 * sun, 0.80),
         L::Building | L::Wall => (air_k + 2.0 + 8.0 * sun, 0.93),
-        L::Barrier | L::Pole | L::Static => (air_k + 8.0 * sun, 0.90),
+        L::Barrier | L::Pole | L::Static | L::Dynamic => (air_k + 8.0 * sun, 0.90),
         L::Vegetation => (air_k + 1.0 * sun, 0.97),
         L::Terrain => (air_k - 1.0 + 6.0 * sun, 0.96),
         L::Sky => (air_k, 1.0),
@@ -144,7 +144,7 @@ fn surface(label: SemanticLabel, air_k: f64, sun: f64) -> (f64, f64) {
         L::Bicycle => (0.7 * clothed_k + 0.3 * air_k, 0.95),
         L::Motorcycle => (0.5 * clothed_k + 0.5 * (air_k + 25.0), 0.94),
         L::Car => (air_k + 7.0 + 12.0 * sun, 0.92),
-        L::Truck | L::Bus => (air_k + 9.0 + 10.0 * sun, 0.92),
+        L::Truck | L::Bus | L::Train => (air_k + 9.0 + 10.0 * sun, 0.92),
     }
 }
 

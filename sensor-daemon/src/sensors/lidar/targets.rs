@@ -44,6 +44,8 @@ pub(in crate::sensors) struct MovingTarget {
     pub(in crate::sensors) object: u32,
     pub(in crate::sensors) word: u32,
     pub(in crate::sensors) is_person: bool,
+    /// SUMO's vehicle class, by its number.
+    pub(in crate::sensors) class: u16,
     pub(in crate::sensors) id_hash: u64,
     /// Keeps its pose for the whole tick, or its motion is not known.
     is_still: bool,
@@ -272,6 +274,7 @@ impl MovingTarget {
             object: state.vehicle,
             word: tag as u32 | INTEREST,
             is_person,
+            class: state.class,
             id_hash: state.id_hash,
             is_still: steps.is_empty() || state.flags & (RESYNCHRONISED | APPEARED) != 0,
             rates: [0.0; 6],

@@ -114,14 +114,17 @@ impl ScanNoise {
 
 /// Mean cross section of a class as seen from the front or rear, and from the side, m². Cars and pedestrians: N. Yamada, Y. Tanaka and
 /// K. Nishikawa, *Radar Cross Section for Pedestrian in 76 GHz Band*, EuMC 2005 (pedestrians −8 dB m²); T. Schipper et al., *RCS of
-/// cars at 76 to 81 GHz*, GeMiC 2011 (cars 10 dB m² along, 20 dB m² broadside). Lorries, buses and two-wheelers are scaled from these.
+/// cars at 76 to 81 GHz*, GeMiC 2011 (cars 10 dB m² along, 20 dB m² broadside). Lorries, buses, trains and two-wheelers are scaled from these.
 fn mean_rcs_m2(label: u8) -> [f64; 2] {
     let is = |known: SemanticLabel| label == known as u8;
     if is(SemanticLabel::Person) {
         [0.16, 0.16]
     } else if is(SemanticLabel::Bicycle) || is(SemanticLabel::Motorcycle) {
         [1.0, 5.0]
-    } else if is(SemanticLabel::Truck) || is(SemanticLabel::Bus) {
+    } else if [SemanticLabel::Truck, SemanticLabel::Bus, SemanticLabel::Train]
+        .into_iter()
+        .any(is)
+    {
         [30.0, 300.0]
     } else {
         [10.0, 100.0]

@@ -8,6 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from caraware.data.recording import Recording, RecordingError
+from caraware.ipc.layout import VEHICLE_CLASSES
 from caraware.ipc.names import Names
 
 
@@ -24,6 +25,11 @@ class Kind(IntEnum):
 
 BODY_SHIFT = 25
 """First bit of `VehicleState.vehicle` that numbers the trailing bodies of a vehicle, from 1 on."""
+
+
+def vehicle_class(state: np.void) -> str:
+    """SUMO's vehicle class of a road user (`VehicleState`); of a trailing body that of its vehicle."""
+    return VEHICLE_CLASSES[int(state["class"])]
 
 
 @dataclass(frozen=True)

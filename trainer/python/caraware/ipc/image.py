@@ -31,6 +31,7 @@ class Label(IntEnum):
     """Class of a pixel: CityScapes' label ids, and from 40 on classes that it counts as road."""
 
     STATIC = 4
+    DYNAMIC = 5
     ROAD = 7
     SIDEWALK = 8
     RAIL_TRACK = 10
@@ -45,6 +46,7 @@ class Label(IntEnum):
     CAR = 26
     TRUCK = 27
     BUS = 28
+    TRAIN = 31
     MOTORCYCLE = 32
     BICYCLE = 33
     LANE_MARKING = 40

@@ -12,6 +12,9 @@ _LAYOUT: dict[str, Any] = json.loads(_native.LAYOUT_JSON)
 SENSOR_BITS: dict[str, int] = {row["name"]: row["bit"] for row in _LAYOUT["sensors"]}
 """Bit of each sensor in an observation's `sensors`, by its name in commands and keys."""
 
+VEHICLE_CLASSES: list[str] = _LAYOUT["vehicle_classes"]
+"""SUMO's vehicle classes, by their numbers in `VehicleState.class`."""
+
 
 def record(name: str) -> np.dtype[np.void]:
     """The record `name` of `ipc-schema/layout.json`: fields, offsets and size."""

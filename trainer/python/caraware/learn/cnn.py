@@ -21,6 +21,7 @@ BRIGHTNESS = {
     Label.SKY: 0.0,
     Label.BUILDING: 0.1,
     Label.STATIC: 0.1,
+    Label.DYNAMIC: 0.1,
     Label.WALL: 0.1,
     Label.BARRIER: 0.1,
     Label.POLE: 0.1,
@@ -38,6 +39,7 @@ BRIGHTNESS = {
     Label.CAR: -0.8,
     Label.TRUCK: -0.9,
     Label.BUS: -1.0,
+    Label.TRAIN: -1.0,
 }
 """What the network sees of each class of a semantic image; markings are the brightest, road users are below zero."""
 

@@ -29,7 +29,6 @@ from caraware.data.export.oxts import Geodesy, packet
 from caraware.data.export.scans import (
     OPTICAL,
     box_middle,
-    class_by_size,
     inverse,
     require_channels,
     rotated,
@@ -38,7 +37,7 @@ from caraware.data.export.scans import (
     vehicle_pose,
 )
 from caraware.data.export.sensors import Omission, carrier_name, lack_colours, left_out, left_out_without
-from caraware.data.names import Kind, RoadUsers
+from caraware.data.names import Kind, vehicle_class
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
 
@@ -169,14 +168,14 @@ class Calibration:
         return "".join(f"{name}: {' '.join(f'{value:.12e}' for value in rows.ravel())}\n" for name, rows in matrices)
 
 
-def kitti_class(state: np.void, vehicle_class: str) -> str:
-    """KITTI's class of a road user, from SUMO's class or, where that is not recorded, from its size."""
+def kitti_class(state: np.void) -> str:
+    """KITTI's class of a road user, from SUMO's."""
     if state["kind"] == Kind.PERSON:
         return "Pedestrian"
-    vehicle_class = vehicle_class or class_by_size(state)
-    if vehicle_class in CLASSES["Truck"] and state["kind"] == Kind.TRAILING:
+    of_sumo = vehicle_class(state)
+    if of_sumo in CLASSES["Truck"] and state["kind"] == Kind.TRAILING:
         return "Misc"
-    return next((name for name, classes in CLASSES.items() if vehicle_class in classes), "Car")
+    return next((name for name, classes in CLASSES.items() if of_sumo in classes), "Car")
 
 
 def _place(state: np.void, camera_from_world: Float64Array) -> tuple[Float64Array, float]:
@@ -197,7 +196,7 @@ def _image_part(seen: np.void, head: np.void) -> tuple[str, str]:
     return f"{truncated:.2f} {occluded}", f"{left:.2f} {top:.2f} {right:.2f} {bottom:.2f}"
 
 
-def _labels(kitti: _KittiFrame, calibration: Calibration, users: RoadUsers) -> str:
+def _labels(kitti: _KittiFrame, calibration: Calibration) -> str:
     """The file of `label_2/`: each road user with a point of the LIDAR or a pixel of an image; boxes of `image_2`."""
     boxes = numbered(kitti.images).get(2)
     seen, head = ({}, None) if boxes is None else (boxes.seen, boxes.head)
@@ -206,7 +205,7 @@ def _labels(kitti: _KittiFrame, calibration: Calibration, users: RoadUsers) -> s
         vehicle = int(state["vehicle"])
         (x, y, z), rotation_y = _place(state, calibration.camera_from_world)
         alpha = float(np.mod(rotation_y - np.arctan2(x, z) + np.pi, 2 * np.pi) - np.pi)
-        name = kitti_class(state, users.of(state["id_hash"]).vehicle_class)
+        name = kitti_class(state)
         hidden, box = "-1 3", "-1 -1 -1 -1"
         if head is not None and vehicle in seen:
             hidden, box = _image_part(seen[vehicle], head)
@@ -219,10 +218,10 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
     require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
-    users, geodesy = RoadUsers(recording), Geodesy(recording)
+    geodesy = Geodesy(recording)
     for kitti in _kitti_frames(recording, episode):
         carrier = path / carrier_name(kitti.frame.carrier).removeprefix("vehicle_")
-        _write_frame(carrier, kitti, users)
+        _write_frame(carrier, kitti)
         line = packet(kitti.frame.own, geodesy)
         (carrier / "training" / "oxts" / f"{kitti.frame.tick:06}.txt").write_text(line, encoding="utf-8")
     if not any(path.iterdir()):
@@ -237,7 +236,7 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
         (carrier / "training" / "times.txt").write_text(times, encoding="utf-8")
 
 
-def _write_frame(carrier: Path, kitti: _KittiFrame, users: RoadUsers) -> None:
+def _write_frame(carrier: Path, kitti: _KittiFrame) -> None:
     training, name = carrier / "training", f"{kitti.frame.tick:06}"
     images = numbered(kitti.images)
     for folder in ("velodyne", "calib", "label_2", "oxts", *(f"image_{number}" for number in images)):
@@ -246,7 +245,7 @@ def _write_frame(carrier: Path, kitti: _KittiFrame, users: RoadUsers) -> None:
     (training / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
     calibration = Calibration.of(kitti)
     (training / "calib" / f"{name}.txt").write_text(calibration.text(), encoding="utf-8")
-    (training / "label_2" / f"{name}.txt").write_text(_labels(kitti, calibration, users), encoding="utf-8")
+    (training / "label_2" / f"{name}.txt").write_text(_labels(kitti, calibration), encoding="utf-8")
     for number, image in images.items():
         if (rgb := image.rgb) is not None:
             Image.fromarray(rgb).save(training / f"image_{number}" / f"{name}.png")

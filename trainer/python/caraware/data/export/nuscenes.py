@@ -35,7 +35,6 @@ from caraware.data.export.frames import (
 )
 from caraware.data.export.scans import (
     box_middle,
-    class_by_size,
     inverse,
     quaternion,
     require_channels,
@@ -45,7 +44,7 @@ from caraware.data.export.scans import (
     vehicle_pose,
 )
 from caraware.data.export.sensors import Omission, SensorLabels, carrier_name, lack_colours, left_out
-from caraware.data.names import BODY_SHIFT, Kind, RoadUsers
+from caraware.data.names import BODY_SHIFT, Kind, vehicle_class
 from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
 
@@ -117,16 +116,16 @@ def token(*words: object) -> str:
     return blake2b("/".join(str(word) for word in words).encode(), digest_size=16).hexdigest()
 
 
-def category(state: np.void, vehicle_class: str) -> str:
-    """nuScenes' category of a road user, from SUMO's class or, where that is not recorded, from its size."""
-    if state["kind"] == Kind.PERSON and vehicle_class != "wheelchair":
+def category(state: np.void) -> str:
+    """nuScenes' category of a road user, from SUMO's class."""
+    of_sumo = vehicle_class(state)
+    if state["kind"] == Kind.PERSON and of_sumo != "wheelchair":
         return "human.pedestrian.adult"
-    vehicle_class = vehicle_class or class_by_size(state)
-    if vehicle_class in CATEGORIES["vehicle.bus.rigid"] and (state["trailing"] or state["kind"] == Kind.TRAILING):
+    if of_sumo in CATEGORIES["vehicle.bus.rigid"] and (state["trailing"] or state["kind"] == Kind.TRAILING):
         return "vehicle.bus.bendy"
-    if vehicle_class in CATEGORIES["vehicle.truck"] and state["kind"] == Kind.TRAILING:
+    if of_sumo in CATEGORIES["vehicle.truck"] and state["kind"] == Kind.TRAILING:
         return "vehicle.trailer"
-    return next((name for name, classes in CATEGORIES.items() if vehicle_class in classes), "vehicle.car")
+    return next((name for name, classes in CATEGORIES.items() if of_sumo in classes), "vehicle.car")
 
 
 def attribute(state: np.void, category_name: str) -> str:
@@ -163,7 +162,6 @@ class _Scene:
     cameras: frozenset[SensorKey]
     """Cameras with colours, whose images its key frames have."""
     labels: SensorLabels
-    users: RoadUsers
     rows: dict[str, list[Row]] = field(default_factory=lambda: {table: [] for table in TABLES})
     key_tick: int | None = None
     """Of the newest key frame."""
@@ -307,7 +305,7 @@ class _Scene:
     def _annotate(self, frame: Frame, state: np.void, sample: str, points: int, echoes: int) -> None:
         """Add the box of a road user in a key frame, and count it for its instance."""
         vehicle = int(state["vehicle"])
-        name = category(state, self.users.of(state["id_hash"]).vehicle_class)
+        name = category(state)
         # Numbers of vehicles are used again, ids are not.
         body = (state["id_hash"], *([place] if (place := vehicle >> BODY_SHIFT) else []))
         instance, row = self.token("instance", *body), self.token("box", sample, *body)
@@ -370,7 +368,7 @@ def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
     require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
-    users, run = RoadUsers(recording), str(recording.start["run"])
+    run = str(recording.start["run"])
     labels = SensorLabels(recording.run, sensor_channel, [LIDAR_CHANNEL])
     log = token(run, "log", episode.number)
     delivered = delivered_sensors(recording, episode)
@@ -382,7 +380,7 @@ def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
         if carrier not in scenes:
             name = f"scene-{episode.number:05}-{carrier_name(carrier).removeprefix('vehicle_')}"
             cameras = _coloured(delivered, carrier)
-            scenes[carrier] = _Scene(name, run, path, log, recording.tick_s, cameras, labels, users)
+            scenes[carrier] = _Scene(name, run, path, log, recording.tick_s, cameras, labels)
         scenes[carrier].add(frame)
     if not scenes:
         raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles or suite")

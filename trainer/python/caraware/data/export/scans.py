@@ -36,15 +36,6 @@ def box_middle(state: np.void) -> Float64Array:
     return np.array([ahead_m, 0.0, 0.0, 1.0])
 
 
-def class_by_size(state: np.void) -> str:
-    """SUMO's class of a vehicle whose class is not recorded, by the sizes that cameras go by."""
-    if state["width_m"] < 1.1:
-        return "bicycle" if state["length_m"] < 1.9 else "motorcycle"
-    if state["length_m"] >= 10 and state["height_m"] < 3.7:
-        return "bus"
-    return "truck" if state["length_m"] > 6 or state["height_m"] > 2.1 else "passenger"
-
-
 def pose(position_m: Array, attitude_rad: Array) -> Float64Array:
     """f64 [4, 4]: world from a frame at this position (m) with this roll, pitch and heading (rad)."""
     transform = rotated(rotation(*(float(angle) for angle in attitude_rad)))

@@ -31,13 +31,13 @@ CAMERA: dict[str, Any] = {
 
 
 class Class(IntEnum):
-    """What the detector tells apart. The simulator's cameras decide a vehicle's class by its size (docs/camera.md)."""
+    """What the detector tells apart. Classes are those of the simulator's cameras (docs/camera.md)."""
 
     PERSON = 0
     TWO_WHEELER = 1
     CAR = 2
     TRUCK = 3
-    """Vans, trucks and buses."""
+    """Vans, trucks, buses and trams."""
 
 
 CLASS_OF = {
@@ -47,6 +47,7 @@ CLASS_OF = {
     Label.CAR: Class.CAR,
     Label.TRUCK: Class.TRUCK,
     Label.BUS: Class.TRUCK,
+    Label.TRAIN: Class.TRUCK,
 }
 
 MIN_HEIGHT_PX, MIN_VISIBLE_PX, MIN_VISIBLE_SHARE, MAX_TRUNCATED = 6, 20, 0.3, 0.5
