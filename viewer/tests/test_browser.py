@@ -1,7 +1,7 @@
 """The whole chain: a run on the town, `caraware view --web`, and the page in a real browser.
 
 `CARAWARE_SCREENSHOT=docs/images/viewer.png pytest viewer/tests/test_browser.py -k train` makes the README's picture,
-and with `CARAWARE_SCREENSHOT_MODE=drive` that of another mode.
+and with `CARAWARE_SCREENSHOT_MODE` that of another mode, or of `sights`, `planes` or `messages`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from ports import free_port
 
-from caraware_viewer import course, plots, scene, sights, space, static_map, top, views
+from caraware_viewer import course, messages, plots, scene, sights, space, static_map, top, views
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
@@ -220,6 +220,24 @@ def wait_for_picture(browser: Browser, find_missing: Callable[[Picture], list[st
         time.sleep(0.5)
 
 
+def wait_for_view(view: list[str], log: Path, find_missing: Callable[[Picture], list[str]], name: str) -> None:
+    """Starts a viewer, opens its page and waits until nothing is missing in it; `name` is that of its picture."""
+    with started(view, log, environment()) as viewing:
+        url = wait_for_line(log, r"open (http://\S+) in a browser", viewing, 120)
+        with Browser(*SIZE) as browser:
+            browser.open(f"{url}?renderer=webgl")
+            browser.wait_for("window._handle !== undefined", 180)
+            picture = wait_for_picture(browser, find_missing, "not in the picture")
+    assert viewing.returncode == 130, log.read_text()
+    keep_picture(picture, name)
+
+
+def keep_picture(picture: Picture, name: str) -> None:
+    """Writes the picture where `CARAWARE_SCREENSHOT` says, if it is the one that is asked for."""
+    if PICTURE and name == PICTURE_MODE:
+        Image.fromarray(picture).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the runs are; it has the run `town-1`, of which a policy can be played."""
@@ -270,8 +288,7 @@ def test_a_browser_shows_every_panel_of_a_mode_and_it_moves(mode: Mode, runs: Pa
         assert viewing.returncode == 130, (tmp_path / "view.log").read_text()
         assert running.poll() is None, "the run ended with its viewer"
     assert hosts <= {"127.0.0.1", None}, "the page sent requests to other hosts"
-    if PICTURE and mode.name == PICTURE_MODE:
-        Image.fromarray(second).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
+    keep_picture(second, mode.name)
     if mode.name == "train":
         check_recording(recorded)
 
@@ -365,15 +382,7 @@ def test_a_browser_shows_what_the_sensors_of_the_followed_vehicle_see(runs: Path
         )
         assert refused.returncode == 1, refused.stderr
         assert "--camera cav.0@rear: there is no such camera; names behind the id: @camera" in refused.stderr
-        with started(view, tmp_path / "view.log", environment()) as viewing:
-            url = wait_for_line(tmp_path / "view.log", r"open (http://\S+) in a browser", viewing, 120)
-            with Browser(*SIZE) as browser:
-                browser.open(f"{url}?renderer=webgl")
-                browser.wait_for("window._handle !== undefined", 180)
-                picture = wait_for_picture(browser, without_sights, "not in the picture")
-        assert viewing.returncode == 130, (tmp_path / "view.log").read_text()
-    if PICTURE and PICTURE_MODE == "sights":
-        Image.fromarray(picture).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
+        wait_for_view(view, tmp_path / "view.log", without_sights, "sights")
     found = recordings.read(recorded)
     images = [row["Image:format"][0] for _, row in found[f"{sights.OF_FOLLOWED}/image"].rows if row.get("Image:format")]
     assert {(image["width"], image["height"]) for image in images} == {(84, 84)} and len(images) >= 2
@@ -382,3 +391,89 @@ def test_a_browser_shows_what_the_sensors_of_the_followed_vehicle_see(runs: Path
     assert detected and np.isfinite(np.array(detected[-1])).all()
     names = {name for value in recordings.layouts(recorded)["ViewBlueprint:display_name"] for name in value}
     assert "Camera of the followed vehicle" in names
+
+
+EYES = """
+[[suite]]
+name = "eyes"
+first = 2
+
+[[suite.sensor]]
+kind = "camera"
+name = "heat"
+infrared = true
+width = 160
+height = 96
+rgb = false
+semantic = false
+
+[[suite.sensor]]
+kind = "camera"
+name = "motion"
+flow = true
+width = 160
+height = 96
+rgb = false
+semantic = false
+depth = false
+binary = false
+
+[[suite.sensor]]
+kind = "camera"
+name = "events"
+events = true
+width = 160
+height = 96
+rgb = true
+"""
+
+
+def without_planes(picture: Picture) -> list[str]:
+    """What the picture does not show of temperatures, motion and events, which are in this order one below another."""
+    column = cameras_of(picture)
+    heat, motion, events = (third[~of_color(third, views.BACKGROUND, 12)] for third in np.array_split(column, 3))
+    spread = motion.max(axis=-1).astype(int) - motion.min(axis=-1)
+    seen = {
+        "greys of temperatures": (np.ptp(heat.astype(int), axis=-1) <= 8).sum() > 4_000,
+        "several temperatures": len(np.unique(heat[np.ptp(heat.astype(int), axis=-1) <= 8] // 16, axis=0)) >= 5,
+        "colours of motion": (spread > 60).sum() > 300,
+        "brighter pixels": of_color(events, (255, 40, 40), 60).sum() > 5,
+        "darker pixels": of_color(events, (60, 90, 255), 60).sum() > 5,
+    }
+    return [what for what, there in seen.items() if not there]
+
+
+def test_a_browser_shows_temperatures_motion_and_events(runs: Path, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = tmp_path / "eyes.toml"
+    config.write_text(EYES, encoding="utf-8")
+    settings = ("weather.sunlight=1.0", "fanout.image_hz=2", f"fanout.listen={endpoint}", *SETTINGS)
+    run = [str(COMMAND), "simulate", str(config), *(part for setting in settings for part in ("--set", setting))]
+    view = [str(COMMAND), "view", endpoint, "--web", "--web-port", str(free_port())]
+    view += [part for name in ("heat", "motion", "events") for part in ("--camera", f"cav.0@{name}")]
+    with started([*run, "--runs", str(runs)], tmp_path / "run.log", environment()) as running:
+        wait_for_line(tmp_path / "run.log", READY["simulate"], running, 300)
+        wait_for_view(view, tmp_path / "view.log", without_planes, "planes")
+
+
+def without_messages(picture: Picture) -> list[str]:
+    """What the picture does not show of messages."""
+    cam, cpm = (rgb(int(messages.SOURCE_COLORS[source])) for source in (1, 2))
+    seen = {
+        "objects known by CAM": of_color(map_of(picture), cam).sum() > 20,
+        "objects known by CPM": of_color(map_of(picture), cpm).sum() > 5,
+        "stations that have just sent": of_color(map_of(picture), messages.SENDER_COLOR, 40).sum() > 20,
+        "known objects in 3-D": of_color(space_of(picture), cam, 40).sum() > 20,
+        "the legend of messages": of_color(legend_of(picture), cam).sum() > 5,
+    }
+    return [what for what, there in seen.items() if not there]
+
+
+def test_a_browser_shows_what_a_vehicle_knows_from_messages(runs: Path, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    settings = ("v2x.share=0.7", "v2x.perception_range_m=50.0", f"fanout.listen={endpoint}", *SETTINGS)
+    run = [str(COMMAND), "simulate", "town", *(part for setting in settings for part in ("--set", setting))]
+    view = [str(COMMAND), "view", endpoint, "--web", "--web-port", str(free_port()), "--messages"]
+    with started([*run, "--runs", str(runs)], tmp_path / "run.log", environment()) as running:
+        wait_for_line(tmp_path / "run.log", READY["simulate"], running, 300)
+        wait_for_view(view, tmp_path / "view.log", without_messages, "messages")

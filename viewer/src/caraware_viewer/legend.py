@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import rerun as rr
 
@@ -13,7 +11,10 @@ from caraware_viewer.canvas import Canvas
 
 SIGNS = "legend/signs"
 
-_ROWS: tuple[tuple[tuple[str, int], ...], ...] = (
+Rows = tuple[tuple[tuple[str, int], ...], ...]
+"""Name and colour (RGBA) of each sign, row by row."""
+
+_ROWS: Rows = (
     (
         ("connected", int(top.KIND_COLORS[0])),
         ("other vehicle", int(top.KIND_COLORS[1])),
@@ -43,24 +44,21 @@ _RADAR_ROW: tuple[tuple[str, int], ...] = (
 """What radars add: the colours of radial velocities."""
 
 
-@dataclass(frozen=True)
-class LegendSize:
-    """Extent of the legend in its own units."""
-
-    width: float
-    height: float
+WIDTH, ROW_HEIGHT = 100.0, 6.5
+"""Extent of a row in the legend's own units."""
 
 
-LEGEND = LegendSize(width=100.0, height=13.0)
+def rows_of(*, messages: bool = False, radars: bool = False) -> Rows:
+    """The signs; `messages` adds a row for what is known from them, `radars` one for velocities."""
+    return (*_ROWS, *([_MESSAGE_ROW] if messages else []), *([_RADAR_ROW] if radars else []))
 
 
-def draw_legend(canvas: Canvas, *, messages: bool = False, radars: bool = False) -> None:
-    """Draws the legend once; `messages` adds a row for what is known from them, `radars` one for velocities."""
-    rows = (*_ROWS, *([_MESSAGE_ROW] if messages else []), *([_RADAR_ROW] if radars else []))
+def draw_legend(canvas: Canvas, rows: Rows) -> None:
+    """Draws the legend once."""
     places, names, colors = [], [], []
     for row, signs in enumerate(rows):
         for column, (name, color) in enumerate(signs):
-            places.append((LEGEND.width * (column + 0.5) / len(signs), LEGEND.height * (row + 0.25) / len(rows)))
+            places.append((WIDTH * (column + 0.5) / len(signs), ROW_HEIGHT * (row + 0.25)))
             names.append(name)
             colors.append(color)
     points = rr.Points2D(

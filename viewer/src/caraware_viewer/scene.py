@@ -19,7 +19,7 @@ from caraware_viewer.detail import Detail, Region
 from caraware_viewer.display import SERVER_MEMORY_MIB
 from caraware_viewer.documents import RoadUserCounts, RunMap, RunStatus
 from caraware_viewer.hud import ViewerFigures, hanging, hud
-from caraware_viewer.legend import draw_legend
+from caraware_viewer.legend import draw_legend, rows_of
 from caraware_viewer.link import WHOLE_COURSE, Sample
 from caraware_viewer.mounted import CAMERA, LIDAR, RADAR, names_on
 from caraware_viewer.pairing import Pairing, distances, mean_m
@@ -138,7 +138,9 @@ class Scene:
         self._stop_lines = _stop_lines(run_map)
         self._paint = draw_map(self._canvas, run_map)
         self._sights = Sights(self._canvas, run_map, cameras, radars)
-        draw_legend(self._canvas, messages=messages, radars=self._sights.has_radars)
+        legend = rows_of(messages=messages, radars=self._sights.has_radars)
+        self.legend_rows = len(legend)
+        draw_legend(self._canvas, legend)
         plots.name_series(self._canvas)
         self.server_mib = SERVER_MEMORY_MIB + _MAPS_KEPT * self._canvas.live_bytes / 2**20
         """What rerun's server has to keep, so that a new browser finds the map in it."""

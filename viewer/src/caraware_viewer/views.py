@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import rerun as rr
 import rerun.blueprint as rrb
 
-from caraware_viewer import course, plots, space
+from caraware_viewer import course, legend, plots, space
 from caraware_viewer.canvas import TIMELINE
 from caraware_viewer.detail import Region
-from caraware_viewer.legend import LEGEND
 from caraware_viewer.static_map import SCALE_BELOW
 
 _MARGIN = 0.02
@@ -21,6 +20,8 @@ MAX_PLOTS = 5
 _STACKED_CAMERAS = 3
 """Most images below one another; of more, two are beside one another."""
 _CAMERA_SHARE = 2.6
+_LEGEND_SHARE = 0.6
+"""Height of a row of the legend, where the top view has 10."""
 
 
 @dataclass(frozen=True)
@@ -75,15 +76,21 @@ def blueprint(
     figures: Collection[str] = (),
     region: Region | None = None,
     cameras: Mapping[str, str] | None = None,
+    legend_rows: int = 2,
 ) -> rrb.Blueprint:
     """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max) or of a region, legend, HUD, 3-D view, images and
     plots.
 
     `figures` are the paths that have data; a view without any is left out. `cameras` are the titles of images by path.
+    The legend has `legend_rows` rows.
     """
     plotted = [_plot(plot) for plot in shown_plots(mode, figures)]
     columns: list[rrb.Container | rrb.View] = [
-        rrb.Vertical(_top_view(bounds_m if region is None else region), _legend(), row_shares=[10, 1.2])
+        rrb.Vertical(
+            _top_view(bounds_m if region is None else region),
+            _legend(legend_rows),
+            row_shares=[10, _LEGEND_SHARE * legend_rows],
+        )
     ]
     shares: list[float] = [5]
     middle: list[rrb.View] = [_hud()]
@@ -125,8 +132,8 @@ def _top_view(bounds_m: Sequence[float]) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(name="Top view", origin="/top", background=BACKGROUND, visual_bounds=visible)
 
 
-def _legend() -> rrb.Spatial2DView:
-    visible = rrb.VisualBounds2D(x_range=[0.0, LEGEND.width], y_range=[0.0, LEGEND.height])
+def _legend(rows: int) -> rrb.Spatial2DView:
+    visible = rrb.VisualBounds2D(x_range=[0.0, legend.WIDTH], y_range=[0.0, rows * legend.ROW_HEIGHT])
     return rrb.Spatial2DView(
         name="Legend", origin="/legend", background=BACKGROUND, visual_bounds=visible, titlebar=False
     )

@@ -126,7 +126,7 @@ class Layout:
         if shown == self._shown:
             return
         self._shown = shown
-        views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region, cameras)
+        views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region, cameras, scene.legend_rows)
         for recording in self.recordings:
             recording.send_blueprint(views, make_active=True, make_default=True)
 
