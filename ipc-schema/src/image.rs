@@ -54,16 +54,39 @@ impl ImagePlane {
         1 << self as u32
     }
 
+    /// Name for readers in other languages.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Depth => "depth_m",
+            Self::Instance => "instance",
+            Self::Semantic => "semantic",
+            Self::Rgb => "rgb",
+            Self::Binary => "binary",
+            Self::Infrared => "infrared",
+            Self::Flow => "flow_px",
+        }
+    }
+
+    /// Numpy's name of the scalar, and how many of them a pixel has.
+    #[must_use]
+    pub const fn pixel(self) -> (&'static str, usize) {
+        match self {
+            Self::Depth => ("<f4", 1),
+            Self::Instance => ("<u4", 1),
+            Self::Semantic | Self::Binary => ("|u1", 1),
+            Self::Rgb => ("|u1", 3),
+            Self::Infrared => ("<u2", 1),
+            Self::Flow => ("<f4", 2),
+        }
+    }
+
     /// Bytes of a pixel.
     #[must_use]
     pub const fn pixel_bytes(self) -> usize {
-        match self {
-            Self::Depth | Self::Instance => 4,
-            Self::Semantic | Self::Binary => 1,
-            Self::Rgb => 3,
-            Self::Infrared => 2,
-            Self::Flow => 8,
-        }
+        let (scalar, count) = self.pixel();
+        // The name ends with the bytes of the scalar.
+        (scalar.as_bytes()[2] - b'0') as usize * count
     }
 
     /// True if a configuration wants it.

@@ -16,7 +16,7 @@ use crate::{
     event::Collision,
     field::FIELDS,
     header::MessageHeader,
-    image::{BrightnessEvent, ImageHead, SeenObject},
+    image::{BrightnessEvent, ImageHead, ImagePlane, SeenObject},
     lane_position::LanePosition,
     pointcloud::{LidarPoint, Scan},
     radar::{RadarDetection, RadarScan},
@@ -492,6 +492,34 @@ pub fn fields() -> Vec<FieldLayout> {
     rows.collect()
 }
 
+/// A plane of an image for readers in other languages.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct PlaneLayout {
+    /// Name in Python.
+    pub name: &'static str,
+    /// Its bit in `ImageHead.planes`.
+    pub bit: u32,
+    /// Numpy's name of a pixel's scalar.
+    pub scalar: &'static str,
+    /// Shape of a pixel.
+    pub shape: Vec<usize>,
+}
+
+/// Every plane of an image, in the order in which a message has them.
+#[must_use]
+pub fn image_planes() -> Vec<PlaneLayout> {
+    let rows = ImagePlane::ALL.into_iter().map(|plane| {
+        let (scalar, count) = plane.pixel();
+        PlaneLayout {
+            name: plane.name(),
+            bit: plane.bit(),
+            scalar,
+            shape: (count > 1).then_some(count).into_iter().collect(),
+        }
+    });
+    rows.collect()
+}
+
 /// A list in JSON with one line for each of its rows.
 fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
     let rows: Result<Vec<String>, _> = rows.iter().map(serde_json::to_string).collect();
@@ -504,11 +532,12 @@ fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
 /// A row has no form in JSON.
 pub fn json() -> Result<String, serde_json::Error> {
     Ok(format!(
-        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"alignment\": {ALIGNMENT},\n  \"types\": {},\n  \"payloads\": {},\n  \"sensors\": {},\n  \"fields\": {},\n  \"vehicle_classes\": {}\n}}\n",
+        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"alignment\": {ALIGNMENT},\n  \"types\": {},\n  \"payloads\": {},\n  \"sensors\": {},\n  \"fields\": {},\n  \"image_planes\": {},\n  \"vehicle_classes\": {}\n}}\n",
         lines(&table())?,
         lines(&payloads())?,
         lines(&sensors())?,
         lines(&fields())?,
+        lines(&image_planes())?,
         lines(&VEHICLE_CLASSES)?
     ))
 }

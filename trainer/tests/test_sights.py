@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from caraware.data.export.scans import distortion, projection, undistorted_projection
 from caraware.data.recording import RecordingError
-from caraware.ipc.image import EVENT, IMAGE, PLANES, SEEN, split_planes
+from caraware.ipc.image import EVENT, IMAGE, SEEN, split_planes
+from caraware.ipc.layout import IMAGE_PLANES
 from caraware.ipc.radar import DETECTION, RADAR_SCAN
 
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
@@ -37,11 +38,11 @@ def test_planes_follow_one_another(wanted: int) -> None:
     head["height"], head["width"], head["planes"] = 3, 5, wanted
     planes = {
         name: generator.integers(0, 255, (3, 5, *shape)).astype(scalar)
-        for name, bit, scalar, shape in PLANES
-        if wanted >> bit & 1
+        for name, bit, scalar, shape in IMAGE_PLANES
+        if wanted & bit
     }
     found = split_planes(head[0], b"".join(plane.tobytes() for plane in planes.values()))
-    assert set(found) == {name for name, *_ in PLANES}
+    assert set(found) == {name for name, *_ in IMAGE_PLANES}
     for name, plane in found.items():
         if name in planes:
             assert plane is not None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from caraware_viewer import layout, wire
+from caraware_viewer.layout import IMAGE_PLANES
 
 RUN_ID = 7
 
@@ -140,11 +141,11 @@ def image(
     height, width = next(iter(pixels.values())).shape[:2]
     row = np.zeros(1, wire.IMAGE_HEAD)
     row["height"], row["width"], row["range_m"] = height, width, 100.0
-    row["planes"] = sum(1 << bit for name, bit, *_ in wire.PLANES if name in pixels)
+    row["planes"] = sum(bit for name, bit, *_ in IMAGE_PLANES if name in pixels)
     for name, value in head.items():
         row[name] = value
     content = b"".join(
-        np.asarray(pixels[name], scalar).tobytes() for name, _, scalar, _ in wire.PLANES if name in pixels
+        np.asarray(pixels[name], scalar).tobytes() for name, _, scalar, _ in IMAGE_PLANES if name in pixels
     )
     rows = np.zeros(len(objects), wire.SEEN_OBJECT)
     for seen, values in zip(rows, objects, strict=True):

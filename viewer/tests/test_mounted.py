@@ -11,6 +11,7 @@ import test_scene
 from test_scene import MAP, Drawn
 
 from caraware_viewer import detections, image, legend, mounted, sights, space, views, wire
+from caraware_viewer.layout import IMAGE_PLANES
 from caraware_viewer.link import LinkError
 from caraware_viewer.mounted import CAMERA, LIDAR, RADAR
 from caraware_viewer.wire import FrameError
@@ -50,7 +51,8 @@ def pixels(entity: Any) -> np.ndarray:
 def test_every_plane_comes_back_whatever_others_there_are() -> None:
     random = np.random.default_rng(3)
     every = {
-        name: random.integers(0, 256, (3, 4, *shape)).astype(np.dtype(scalar)) for name, _, scalar, shape in wire.PLANES
+        name: random.integers(0, 256, (3, 4, *shape)).astype(np.dtype(scalar))
+        for name, _, scalar, shape in IMAGE_PLANES
     }
     for names in ([*every], ["depth_m", "rgb"], ["instance"], ["semantic", "binary"]):
         chosen: dict[str, Any] = {name: every[name] for name in names}

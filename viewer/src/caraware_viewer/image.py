@@ -127,7 +127,7 @@ PAINTERS: dict[str, Callable[[NDArray[Any], wire.CameraImage], NDArray[np.uint8]
     "flow_px": _by_motion,
     "instance": _by_number,
 }
-"""How a plane becomes colours `[h, w, 3]`, by its name in `wire.PLANES`: the first that an image has is drawn."""
+"""How a plane becomes colours `[h, w, 3]`, by its name: the first that an image has is drawn."""
 
 
 def colors(image: wire.CameraImage) -> NDArray[np.uint8]:

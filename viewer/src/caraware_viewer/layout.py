@@ -41,12 +41,20 @@ class _SensorRow(TypedDict):
     bit: int
 
 
+class _PlaneRow(TypedDict):
+    name: str
+    bit: int
+    scalar: str
+    shape: list[int]
+
+
 class _Tables(TypedDict):
     schema_version: int
     alignment: int
     types: list[_RecordRow]
     payloads: list[_PayloadRow]
     sensors: list[_SensorRow]
+    image_planes: list[_PlaneRow]
 
 
 _TABLES: _Tables = json.loads(resources.files("caraware_viewer").joinpath("layout.json").read_text(encoding="utf-8"))
@@ -114,6 +122,12 @@ class Sensor:
     bit: int
     """Bit of an observation's `sensors`: the sensor delivers."""
 
+
+IMAGE_PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = tuple(
+    (row["name"], row["bit"], row["scalar"], tuple(row["shape"])) for row in _TABLES["image_planes"]
+)
+"""Name, bit in `ImageHead.planes`, scalar and shape of a pixel of each plane, in the order in which a message has
+them."""
 
 SENSORS = [Sensor(row["name"], row["label"], row["bit"]) for row in _TABLES["sensors"]]
 """Every sensor, in the order of an observation's ages."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caraware_viewer.layout import ALIGNMENT, DIMENSIONS, RECORDS, SCHEMA_VERSION, SECTIONS, SENSORS
+from caraware_viewer.layout import ALIGNMENT, DIMENSIONS, IMAGE_PLANES, RECORDS, SCHEMA_VERSION, SECTIONS, SENSORS
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
@@ -56,16 +56,6 @@ IMAGE_HEAD = RECORDS["ImageHead"]
 """Pose of a camera at the end of the tick, and the size of its image."""
 SEEN_OBJECT = RECORDS["SeenObject"]
 """A road user of which an image shows a pixel: its class, boxes (pixels) and depths (metres)."""
-PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = (
-    ("depth_m", 0, "<f4", ()),
-    ("instance", 1, "<u4", ()),
-    ("flow_px", 6, "<f4", (2,)),
-    ("infrared", 5, "<u2", ()),
-    ("semantic", 2, "|u1", ()),
-    ("rgb", 3, "|u1", (3,)),
-    ("binary", 4, "|u1", ()),
-)
-"""Name, bit in `planes`, scalar and shape of a pixel of each plane of an image, in their order."""
 BRIGHTNESS_EVENT = RECORDS["BrightnessEvent"]
 """A pixel became brighter or darker: time since the begin of the tick (µs), column, row, polarity."""
 RADAR_SCAN = RECORDS["RadarScan"]
@@ -225,7 +215,7 @@ class CameraImage:
     head: np.void
     """`IMAGE_HEAD`."""
     planes: dict[str, NDArray[Any]]
-    """The planes that the frame has, `[h, w]`, `[h, w, 2]` and `[h, w, 3]`, by their names in `PLANES`."""
+    """The planes that the frame has, `[h, w]`, `[h, w, 2]` and `[h, w, 3]`, by their names in `IMAGE_PLANES`."""
     objects: NDArray[np.void]
     """`SEEN_OBJECT [count]`."""
     events: NDArray[np.void]
@@ -313,8 +303,8 @@ def decode_image(frame: bytes) -> CameraImage:
     content = sections["planes"].tobytes()
     planes: dict[str, NDArray[Any]] = {}
     offset = 0
-    for name, bit, scalar, shape in PLANES:
-        if int(head["planes"]) >> bit & 1 == 0:
+    for name, bit, scalar, shape in IMAGE_PLANES:
+        if int(head["planes"]) & bit == 0:
             continue
         count = math.prod((*size, *shape))
         length = count * np.dtype(scalar).itemsize

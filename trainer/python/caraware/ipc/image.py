@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from caraware import _native
 from caraware.ipc.arrays import Float32Array
-from caraware.ipc.layout import record
+from caraware.ipc.layout import IMAGE_PLANES, record
 from caraware.ipc.mounts import MountedSensor, SensorNames
 from caraware.ipc.run_file import RunFile
 
@@ -54,18 +54,6 @@ class Label(IntEnum):
     CROSSING = 42
 
 
-PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = (
-    ("depth_m", 0, "<f4", ()),
-    ("instance", 1, "<u4", ()),
-    ("flow_px", 6, "<f4", (2,)),
-    ("infrared", 5, "<u2", ()),
-    ("semantic", 2, "|u1", ()),
-    ("rgb", 3, "|u1", (3,)),
-    ("binary", 4, "|u1", ()),
-)
-"""Name, bit, scalar and shape of a pixel of each plane, in the order in which a message has them."""
-
-
 @dataclass(frozen=True)
 class ImageShape:
     """The images in observations (`camera.observed`)."""
@@ -84,7 +72,7 @@ class ImageShape:
         plane = str(camera.get("observed", "none"))
         if plane == "none" or int(camera["vehicles"]) == 0:
             return None
-        shape = next(shape for name, _, _, shape in PLANES if name == plane)
+        shape = next(shape for name, _, _, shape in IMAGE_PLANES if name == plane)
         return cls(plane, math.prod(shape), int(camera["height"]), int(camera["width"]))
 
     @property
@@ -155,9 +143,9 @@ def split_planes(head: np.void, planes: bytes) -> dict[str, NDArray[Any] | None]
     height, width = int(head["height"]), int(head["width"])
     found: dict[str, NDArray[Any] | None] = {}
     at = 0
-    for name, bit, scalar, shape in PLANES:
+    for name, bit, scalar, shape in IMAGE_PLANES:
         found[name] = None
-        if int(head["planes"]) >> bit & 1:
+        if int(head["planes"]) & bit:
             count = height * width * math.prod(shape)
             plane = np.frombuffer(planes, np.dtype(scalar), count, at)
             found[name] = plane.reshape(height, width, *shape)

@@ -12,6 +12,12 @@ _LAYOUT: dict[str, Any] = json.loads(_native.LAYOUT_JSON)
 SENSOR_BITS: dict[str, int] = {row["name"]: row["bit"] for row in _LAYOUT["sensors"]}
 """Bit of each sensor in an observation's `sensors`, by its name in commands and keys."""
 
+IMAGE_PLANES: tuple[tuple[str, int, str, tuple[int, ...]], ...] = tuple(
+    (row["name"], row["bit"], row["scalar"], tuple(row["shape"])) for row in _LAYOUT["image_planes"]
+)
+"""Name, bit in `ImageHead.planes`, scalar and shape of a pixel of each plane, in the order in which a message has
+them."""
+
 VEHICLE_CLASSES: list[str] = _LAYOUT["vehicle_classes"]
 """SUMO's vehicle classes, by their numbers in `VehicleState.class`."""
 

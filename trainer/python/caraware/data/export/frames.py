@@ -12,7 +12,8 @@ import numpy as np
 from caraware.data.export.scans import OPTICAL, forward_m, inverse, pose, require_channels, rotated
 from caraware.data.recording import Array, Episode, Message, Recording
 from caraware.ipc.arrays import Float64Array
-from caraware.ipc.image import PLANES, split_planes
+from caraware.ipc.image import split_planes
+from caraware.ipc.layout import IMAGE_PLANES
 from caraware.ipc.mounts import ROADSIDE, MountedSensor, SensorNames, sensor_number
 
 CHANNELS = {"pointcloud": "lidar", "image": "camera", "radar": "radar"}
@@ -87,7 +88,7 @@ class CameraImage(SensorMessage):
     @property
     def planes(self) -> tuple[str, ...]:
         """Names of the planes that it has."""
-        return tuple(name for name, bit, *_ in PLANES if int(self.head["planes"]) >> bit & 1)
+        return tuple(name for name, bit, *_ in IMAGE_PLANES if int(self.head["planes"]) & bit)
 
     @property
     def world_from_optical(self) -> Float64Array:
