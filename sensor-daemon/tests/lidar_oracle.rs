@@ -19,7 +19,7 @@ fn tally(
     moves: Moves,
     is_rolling: bool,
     lean: [f64; 2],
-    carriers: std::ops::Range<usize>,
+    carriers: impl IntoIterator<Item = usize>,
 ) -> ScanTotals {
     let mut config = exact_config();
     config.lidar.rolling_shutter = is_rolling;
@@ -88,4 +88,17 @@ fn on_hills_with_rolling_shutter() {
 #[test]
 fn upright_on_hills() {
     check(&tally(&hilly(), Moves::Straight, true, [0.0; 2], 26..30));
+}
+
+/// LIDARs on a viaduct and below it.
+#[test]
+fn on_and_under_a_bridge() {
+    let scene = lidar_city::bridged();
+    for (moves, is_rolling) in [(Moves::Straight, true), (Moves::Wildly, false)] {
+        let carriers = lidar_city::carriers_at_the_bridge(&scene, moves, 2);
+        let tally = tally(&scene, moves, is_rolling, [0.0; 2], carriers);
+        let off = tally.rays - tally.same;
+        assert!(off * 10_000 <= tally.rays, "{off} of {} differ", tally.rays);
+        assert_eq!(off, tally.grazing, "every difference is a grazed edge");
+    }
 }

@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import sumo  # type: ignore[import-untyped]  # the wheel of SUMO has no stubs
+from caraware.data.recording import open_recording
+from caraware.ipc.image import split_planes
 
 VALLEY = Path(__file__).parents[1]
 ROOT = VALLEY.parents[1]
@@ -118,26 +120,53 @@ def test_an_hours_traffic_begins_without_jam_or_collision(built: Path) -> None:
     assert kinds["tram"] >= 4 and kinds["bicycle"] > 60 and kinds["car"] > 200, kinds
 
 
-def test_it_is_simulated_with_trams_and_bicycles_that_sense(built: Path) -> None:
-    arguments = [
-        "simulate",
-        "valley.sumocfg",
-        "--end",
-        "90",
-        "--name",
-        "valley",
-        "--quiet",
-        "--set",
-        "fanout.enabled=false",
-    ]
+def simulate(built: Path, name: str, end_s: int, settings: tuple[str, ...] = ()) -> Path:
+    """Simulates the valley; returns the directory of the run."""
+    arguments = ["simulate", "valley.sumocfg", "--end", str(end_s), "--name", name, "--quiet"]
+    arguments += [word for setting in ("fanout.enabled=false", *settings) for word in ("--set", setting)]
     environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{built}/r", "CARAWARE_PYTHON": sys.executable}
     ran = subprocess.run(
         [CARAWARE, *arguments], cwd=built, env=environment, capture_output=True, text=True, timeout=600
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    report = json.loads((built / "runs" / "valley" / "report.json").read_text())
+    return built / "runs" / name
+
+
+def test_it_is_simulated_with_trams_and_bicycles_that_sense(built: Path) -> None:
+    report = json.loads((simulate(built, "valley", 90) / "report.json").read_text())
     departed = report["traffic"]["departed"]
     assert departed["tram"] == 2 and departed["bicycle"] > 10 and departed["passenger"] > 30, departed
     assert report["traffic"]["teleports"] == 0
     # Mirrors follow SUMO up the hill and over the bridges without being set onto it.
     assert report["dynamics"]["resynchronisations"] == 0, report["dynamics"]
+
+
+EYES = (
+    "camera.vehicles=64",
+    "camera.width=16",
+    "camera.height=16",
+    "camera.horizontal_fov_deg=20",
+    "camera.mount=[0.0, 0.0, 1.5, 0.0, -1.5707, 0.0]",
+    "camera.period_s=0.5",
+    "record.manner=lossless",
+    'record.channels=["image"]',
+)
+"""Cameras that look straight down from 1.5 m above the rear axle."""
+
+
+def test_under_every_vehicle_is_a_road_on_the_bridge_too(built: Path, net: ET.Element) -> None:
+    """The ground has one height at each place: without a deck a vehicle on the bypass saw the streets far below."""
+    bypass, heights_m, on_bridge = street(net, "bypass"), [], 0
+    for message in open_recording(simulate(built, "eyes", 150, EYES)).messages("image"):
+        head = message.section("head")[0]
+        depth_m = split_planes(head, message.section("planes").tobytes())["depth_m"]
+        assert depth_m is not None
+        heights_m.append(float(np.median(depth_m)))
+        x, y, z = head["position_m"]
+        is_on_bypass = abs(y - np.interp(x, bypass[:, 0], bypass[:, 1])) < 8.0
+        over = min(abs(x - crossed) for crossed in (300, 700, 1100)) < 4.0
+        on_bridge += int(is_on_bypass and over and abs(z - 1.5 - np.interp(x, bypass[:, 0], bypass[:, 2])) < 1.0)
+    assert len(heights_m) > 1000 and on_bridge >= 2, (len(heights_m), on_bridge)
+    # The grid of the ground has cells of 5 m, and slopes change between them.
+    assert np.percentile(heights_m, [1, 99]) == pytest.approx(1.5, abs=0.4)
+    assert max(heights_m) < 3.0, max(heights_m)

@@ -2,6 +2,7 @@
 
 use ipc_schema::traffic::class_number;
 use sensor_daemon::sensors::camera::{SKY_INSTANCE, SemanticLabel};
+use sim_core::scene::{NO_JUNCTION, RoadPiece, SurfaceKind};
 
 use crate::{
     CameraModel, CameraScratch, GROUND, Kind, Road, Scene, Taken, VehicleState, car, config, params, rectangle,
@@ -96,6 +97,53 @@ fn each_kind_of_road_user_has_its_class_and_is_white() {
         assert_eq!((instance, label, binary), (1, expected as u8, 255));
         assert_eq!(taken.objects[0].label, expected as u32);
     }
+}
+
+/// A road at the height 1 m from west to east, and one at 8 m from south to north on a deck of 0.8 m.
+fn crossing_levels() -> Scene {
+    let lane = |id: &str, shape_m: Vec<[f64; 3]>| RoadPiece {
+        id: id.into(),
+        surface: SurfaceKind::Lane,
+        shape_m,
+        half_width_m: Some(3.0),
+        junctions: [NO_JUNCTION; 2],
+    };
+    let pieces = vec![
+        lane("below_0", vec![[-90.0, 0.0, 1.0], [90.0, 0.0, 1.0]]),
+        lane("above_0", vec![[0.0, -90.0, 8.0], [0.0, 90.0, 8.0]]),
+    ];
+    Scene::new(Road::new(pieces), Vec::new(), Vec::new())
+}
+
+#[test]
+fn a_bridge_is_a_road_on_top_and_seen_from_below() {
+    let scene = crossing_levels();
+    let seen = |x_m: f64, z_m: f64, mount: [f64; 6]| {
+        let camera = CameraModel::new(&params(100, 100, mount), &config(), &scene);
+        let state = VehicleState {
+            z_m,
+            ..car(0, x_m, 0.0, 0.0)
+        };
+        let (taken, _) = take(&camera, &[state], 0, &mut CameraScratch::default());
+        // The ray beside the optical axis: one half pixel off it.
+        at(&taken, 50, 50)
+    };
+    let straight = |pitch: f64| [0.0, 0.0, 1.5, 0.0, pitch, 0.0];
+    let half_turn = std::f64::consts::FRAC_PI_2;
+    let is = |(instance, depth_m, label, _): (u32, f32, u8, u8), wanted: SemanticLabel, wanted_m: f32| {
+        assert_eq!((instance, label), (GROUND, wanted as u8));
+        assert!((depth_m - wanted_m).abs() < 0.01, "{depth_m} instead of {wanted_m}");
+    };
+    // From below, straight up to the underside; on the deck, straight down; from the west, at its side and under it.
+    is(
+        seen(0.0, 1.0, straight(half_turn)),
+        SemanticLabel::Bridge,
+        8.0 - 0.8 - 2.5,
+    );
+    is(seen(0.0, 8.0, straight(-half_turn)), SemanticLabel::Road, 1.5);
+    let side = [0.0, 0.0, 6.6, 0.0, 0.0, 0.0];
+    is(seen(-30.0, 1.0, side), SemanticLabel::Bridge, 27.0);
+    is(seen(-4.0, 1.0, straight(-half_turn)), SemanticLabel::Road, 1.5);
 }
 
 #[test]

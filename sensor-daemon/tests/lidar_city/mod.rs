@@ -12,7 +12,7 @@ use ipc_schema::{
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
-use sim_core::scene::{Prism, Road, RoadPiece, Scene, SolidClass, SurfaceKind};
+use sim_core::scene::{Prism, Road, RoadPiece, Scene, SolidClass, SurfaceKind, shape::contains};
 
 pub mod oracle;
 
@@ -151,6 +151,45 @@ pub fn hilly() -> Scene {
     Scene::new(bare.road().clone(), buildings.collect(), Vec::new())
 }
 
+/// The test city on hills with a viaduct of 8 m width over the street in its middle.
+pub fn bridged() -> Scene {
+    let hills = hilly();
+    let at = |step: u32| {
+        let x = 20.0 * f64::from(step) - 380.0;
+        [x, 0.0, 15.0 + 2.0 * (x / 90.0).sin()]
+    };
+    let mut pieces = hills.road().pieces().to_vec();
+    pieces.push(RoadPiece {
+        id: "viaduct_0".into(),
+        surface: SurfaceKind::Lane,
+        shape_m: (0..39).map(at).collect(),
+        half_width_m: Some(4.0),
+        junctions: [1; 2],
+    });
+    Scene::new(Road::new(pieces), hills.buildings().to_vec(), Vec::new())
+}
+
+/// Rows of vehicles on the viaduct and below it, some of each.
+pub fn carriers_at_the_bridge(scene: &Scene, moves: Moves, seed: u64) -> Vec<usize> {
+    let (mut states, _) = traffic(200, 60, moves, 0, seed);
+    stand_on(scene, &mut states);
+    let at_bridge = |state: &VehicleState| deck_at(scene, state).is_some() && state.kind == Kind::Cav as u32;
+    let (mut above, mut below) = (Vec::new(), Vec::new());
+    for (row, state) in states.iter().enumerate().filter(|(_, state)| at_bridge(state)) {
+        let is_above = state.z_m > scene.ground_height_m(state.x_m, state.y_m) + 1.0;
+        if is_above { &mut above } else { &mut below }.push(row);
+    }
+    assert!(!above.is_empty() && !below.is_empty(), "{above:?} {below:?}");
+    [&above[..above.len().min(2)], &below[..below.len().min(2)]].concat()
+}
+
+/// Top of the deck above or below a road user, metres.
+fn deck_at(scene: &Scene, state: &VehicleState) -> Option<f64> {
+    let place = [state.x_m, state.y_m];
+    let deck = scene.decks().iter().find(|deck| contains(&deck.outline_m, place));
+    deck.map(|deck| deck.z_m[1])
+}
+
 /// Parts of a vehicle, as shares of its length from the rear and of its height: those of docs/camera.md.
 pub fn parts(state: &VehicleState) -> Vec<[f64; 4]> {
     match (state.length_m, state.height_m) {
@@ -160,10 +199,13 @@ pub fn parts(state: &VehicleState) -> Vec<[f64; 4]> {
     }
 }
 
-/// Puts road users onto the ground.
+/// Puts road users onto the ground, and every second one that is at a deck onto that.
 pub fn stand_on(scene: &Scene, states: &mut [VehicleState]) {
     for state in states {
-        state.z_m = scene.ground_height_m(state.x_m, state.y_m);
+        state.z_m = match deck_at(scene, state) {
+            Some(deck_m) if state.vehicle % 2 == 0 => deck_m,
+            _ => scene.ground_height_m(state.x_m, state.y_m),
+        };
     }
 }
 

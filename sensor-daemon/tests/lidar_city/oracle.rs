@@ -146,8 +146,8 @@ pub fn rays(config: &Config, state: &VehicleState, steps: &[SubStep]) -> Vec<One
 pub struct WorldTick<'a> {
     /// `None` without buildings.
     buildings: Option<TriMesh>,
-    /// Building of each triangle.
-    owner: Vec<u32>,
+    /// Object of each triangle.
+    objects: Vec<u32>,
     /// Ground that is not flat.
     ground: Option<TriMesh>,
     states: &'a [VehicleState],
@@ -156,26 +156,29 @@ pub struct WorldTick<'a> {
     range_m: f64,
 }
 
-/// Triangles of all buildings: walls, roofs (ears cut off) and undersides, and the building of each.
+/// Triangles of all buildings and of the slices of decks: walls, roofs (ears cut off) and undersides, and the object of each.
 pub fn triangles(scene: &Scene) -> (Vec<[f64; 3]>, Vec<[u32; 3]>, Vec<u32>) {
-    let (mut vertices, mut faces, mut owner) = (Vec::new(), Vec::new(), Vec::new());
-    for (number, building) in (0_u32..).zip(scene.buildings()) {
-        let n = building.outline_m.len() as u32;
+    let (mut vertices, mut faces, mut objects) = (Vec::new(), Vec::new(), Vec::new());
+    let buildings = (STATIC_OBJECT..).zip(scene.buildings());
+    let buildings = buildings.map(|(object, building)| (object, building.outline_m.clone(), building.z_m()));
+    let decks = scene.decks().iter();
+    for (object, outline_m, z_m) in buildings.chain(decks.map(|deck| (GROUND, deck.outline_m.to_vec(), deck.z_m))) {
+        let n = outline_m.len() as u32;
         let first = vertices.len() as u32;
-        for z in building.z_m() {
-            vertices.extend(building.outline_m.iter().map(|[x, y]| [*x, *y, z]));
+        for z in z_m {
+            vertices.extend(outline_m.iter().map(|[x, y]| [*x, *y, z]));
         }
         for i in 0..n {
             let (a, b) = (first + i, first + (i + 1) % n);
             faces.extend([[a, b, b + n], [a, b + n, a + n]]);
         }
-        for ear in ears(&building.outline_m) {
+        for ear in ears(&outline_m) {
             faces.push(ear.map(|corner| first + n + corner));
             faces.push([ear[0], ear[2], ear[1]].map(|corner| first + corner));
         }
-        owner.resize(faces.len(), number);
+        objects.resize(faces.len(), object);
     }
-    (vertices, faces, owner)
+    (vertices, faces, objects)
 }
 
 /// The ground as docs/lidar.md has it: cells of 5 m, larger where there would be more than 250 000, 100 m beyond the outermost road, two triangles each.
@@ -227,11 +230,11 @@ fn ears(outline: &[[f64; 2]]) -> Vec<[u32; 3]> {
 
 impl<'a> WorldTick<'a> {
     pub fn new(config: &Config, scene: &Scene, states: &'a [VehicleState], steps: &'a [SubStep]) -> Self {
-        let (vertices, faces, owner) = triangles(scene);
+        let (vertices, faces, objects) = triangles(scene);
         let vertices = vertices.iter().map(|[x, y, z]| Vector::new(*x, *y, *z)).collect();
         Self {
             buildings: TriMesh::new(vertices, faces).ok(),
-            owner,
+            objects,
             ground: (!scene.road().pieces().is_empty()).then(|| relief(scene)),
             states,
             steps,
@@ -262,8 +265,8 @@ impl<'a> WorldTick<'a> {
         }
         let met = self.buildings.as_ref();
         if let Some(met) = met.and_then(|met| met.cast_local_ray_and_get_normal(&cast, self.range_m, false)) {
-            let face = met.subshape as usize % self.owner.len();
-            offer(met.time_of_impact, STATIC_OBJECT | self.owner[face]);
+            let face = met.subshape as usize % self.objects.len();
+            offer(met.time_of_impact, self.objects[face]);
         }
         let k = self.steps.len() / self.states.len();
         for (number, state) in self.states.iter().enumerate() {
@@ -404,6 +407,7 @@ fn is_grazing(world: &WorldTick<'_>, ray: &OneRay, row: usize, range_m: f64, obj
             },
             row,
         );
-        hit.object == object
+        // The ground is before and behind every edge of its own.
+        hit.object == object && (object != GROUND || (hit.range_m - range_m).abs() < 0.02 * range_m + 0.1)
     })
 }

@@ -14,6 +14,7 @@ use crate::geodesy::GeodesyError;
 
 mod building;
 pub mod chart;
+mod deck;
 mod grid;
 mod level;
 mod prop;
@@ -23,6 +24,7 @@ mod xml;
 
 use building::FoundObjects;
 pub use building::{Prism, SolidClass};
+pub use deck::DeckSlice;
 pub use grid::Grid;
 pub use prop::Prop;
 pub use road::{NO_JUNCTION, Road, RoadPiece, SurfaceKind};
@@ -233,7 +235,13 @@ impl Scene {
         against.next().is_some_and(|first| first && against.all(|other| other))
     }
 
-    /// Height of the ground: of the road, or of the nearest one. Metres.
+    /// Decks on which roads of a net with elevation pass over others, in slices.
+    #[must_use]
+    pub fn decks(&self) -> &[DeckSlice] {
+        self.road.decks()
+    }
+
+    /// Height of the ground: of the lowest road, or of the nearest one. Roads on decks do not count. Metres.
     #[must_use]
     pub fn ground_height_m(&self, x_m: f64, y_m: f64) -> f64 {
         ground_height_m(&self.road, [x_m, y_m])
@@ -268,12 +276,9 @@ fn ground_height_m(road: &Road, point: Point) -> f64 {
     if let Some(height_m) = road.flat_height_m() {
         return height_m;
     }
-    if let Some(height_m) = road.under(point).map(|(_, height_m)| height_m).min_by(f64::total_cmp) {
-        return height_m;
-    }
     let mut reach_m = GROUND_REACH_M;
     while reach_m < GROUND_LIMIT_M {
-        if let Some((_, height_m)) = road.nearest(point, reach_m, |_| true) {
+        if let Some(height_m) = road.ground_m(point, reach_m) {
             return height_m;
         }
         reach_m *= 2.0;

@@ -2,6 +2,7 @@
 
 use super::{
     SceneError,
+    deck::{self, DeckSlice, DeckSpans},
     grid::Grid,
     shape::{Bounds, Point, between, contains, distance, dot, from_to, share_along},
     xml::{ElementPosition, XmlTag, attribute, for_each_tag, points},
@@ -119,7 +120,7 @@ impl RoadPiece {
     }
 
     /// Offset to the left at a point of the centre line that keeps both neighbours one metre away; at most 2 m long.
-    fn mitre(&self, place: usize) -> Point {
+    pub(super) fn mitre(&self, place: usize) -> Point {
         let count = self.shape_m.len();
         let normal = |a: usize, b: usize| {
             let d = from_to(flat(self.shape_m[a]), flat(self.shape_m[b]));
@@ -197,11 +198,12 @@ impl RoadPiece {
         }
     }
 
-    /// Distance from `point` to this part, 0 on it, and height of the part at the place nearest to it, metres.
-    fn nearest(&self, part: usize, point: Point) -> (f64, f64) {
-        let nearest = |from: [f64; 3], to: [f64; 3]| {
+    /// Distance from `point` to this part, 0 on it, and height of the part at the place nearest to it, metres. Of a strip only what lies
+    /// between these shares of the segment counts.
+    fn nearest(&self, part: usize, [first, last]: [f64; 2], point: Point) -> (f64, f64) {
+        let nearest = |from: [f64; 3], to: [f64; 3], [first, last]: [f64; 2]| {
             let (a, b) = (flat(from), flat(to));
-            let share = share_along(a, b, point).clamp(0.0, 1.0);
+            let share = share_along(a, b, point).clamp(first, last);
             (
                 distance(between(a, b, share), point),
                 from[2] + share * (to[2] - from[2]),
@@ -209,7 +211,7 @@ impl RoadPiece {
         };
         match self.half_width_m {
             Some(half_m) => {
-                let (distance_m, height_m) = nearest(self.shape_m[part], self.shape_m[part + 1]);
+                let (distance_m, height_m) = nearest(self.shape_m[part], self.shape_m[part + 1], [first, last]);
                 ((distance_m - half_m).max(0.0), height_m)
             }
             None => {
@@ -220,13 +222,16 @@ impl RoadPiece {
                 let last = self.shape_m.last().copied().into_iter();
                 let edges = last.chain(self.shape_m.iter().copied()).zip(&self.shape_m);
                 edges
-                    .map(|(from, to)| nearest(from, *to))
+                    .map(|(from, to)| nearest(from, *to, WHOLE))
                     .min_by(|a, b| a.0.total_cmp(&b.0))
                     .unwrap_or((f64::INFINITY, 0.0))
             }
         }
     }
 }
+
+/// All of a segment, by shares.
+const WHOLE: [f64; 2] = [0.0, 1.0];
 
 fn flat([x, y, _]: [f64; 3]) -> Point {
     [x, y]
@@ -240,6 +245,9 @@ pub struct Road {
     parts: Vec<(u32, u32)>,
     index: Grid,
     is_flat: bool,
+    /// Where pieces pass over others.
+    deck_spans: DeckSpans,
+    decks: Vec<DeckSlice>,
 }
 
 impl Road {
@@ -258,12 +266,22 @@ impl Road {
             .iter()
             .flat_map(|piece| &piece.shape_m)
             .all(|point| point[2] == 0.0);
-        Self {
+        let mut road = Self {
             index: Grid::new(&bounds, CELL_M),
             pieces,
             parts,
             is_flat,
+            deck_spans: DeckSpans::new(),
+            decks: Vec::new(),
+        };
+        if !is_flat {
+            road.deck_spans = deck::spans(&road);
+            let of_pieces = road.deck_spans.iter();
+            road.decks = of_pieces
+                .flat_map(|(piece, spans)| deck::slices(&road.pieces[*piece as usize], spans))
+                .collect();
         }
+        road
     }
 
     /// Reads a net file.
@@ -312,6 +330,67 @@ impl Road {
         self.is_flat.then_some(0.0)
     }
 
+    /// Slices of the decks on which roads pass over others.
+    #[must_use]
+    pub fn decks(&self) -> &[DeckSlice] {
+        &self.decks
+    }
+
+    /// Height of the ground at `point`, metres: of the lowest road that it lies on, or of the nearest one within `reach_m`. Roads on decks
+    /// do not count.
+    pub(super) fn ground_m(&self, point: Point, reach_m: f64) -> Option<f64> {
+        let parts = self.index.at(point).iter().filter_map(|&entry| {
+            let (piece, part) = self.parts[entry as usize];
+            let height_m = self.pieces[piece as usize].height_at(part as usize, point)?;
+            (!self.is_deck(piece, part, point)).then_some(height_m)
+        });
+        parts
+            .min_by(f64::total_cmp)
+            .or_else(|| self.nearest_ground_m(point, reach_m))
+    }
+
+    fn nearest_ground_m(&self, point: Point, reach_m: f64) -> Option<f64> {
+        let mut found = Vec::new();
+        self.index.near(&Bounds::about(point, reach_m), &mut found);
+        let mut nearest: Option<(f64, f64)> = None;
+        let mut offer = |piece: u32, part: u32, shares: [f64; 2]| {
+            let (distance_m, height_m) = self.pieces[piece as usize].nearest(part as usize, shares, point);
+            if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
+                nearest = Some((distance_m, height_m));
+            }
+        };
+        for entry in found {
+            let (piece, part) = self.parts[entry as usize];
+            match self.deck_spans.get(&piece) {
+                None => offer(piece, part, WHOLE),
+                Some(spans) => {
+                    let (begin_m, [a, b]) = self.segment(piece, part);
+                    let shares = deck::off_decks(spans, begin_m, distance(a, b));
+                    shares.into_iter().for_each(|shares| offer(piece, part, shares));
+                }
+            }
+        }
+        nearest.map(|(_, height_m)| height_m)
+    }
+
+    /// True if a point on this part is on a deck.
+    fn is_deck(&self, piece: u32, part: u32, point: Point) -> bool {
+        let Some(spans) = self.deck_spans.get(&piece) else {
+            return false;
+        };
+        let (begin_m, [a, b]) = self.segment(piece, part);
+        let at_m = begin_m + share_along(a, b, point).clamp(0.0, 1.0) * distance(a, b);
+        spans.iter().any(|[from_m, to_m]| (*from_m..=*to_m).contains(&at_m))
+    }
+
+    /// A segment of a strip, and how far along the strip it begins, metres.
+    fn segment(&self, piece: u32, part: u32) -> (f64, [Point; 2]) {
+        let shape_m = &self.pieces[piece as usize].shape_m;
+        let lengths = shape_m[..=part as usize].windows(2);
+        let begin_m = lengths.map(|ends| distance(flat(ends[0]), flat(ends[1]))).sum();
+        (begin_m, [part, part + 1].map(|place| flat(shape_m[place as usize])))
+    }
+
     /// Pieces that `point` lies on, with the height there.
     pub fn under(&self, point: Point) -> impl Iterator<Item = (&RoadPiece, f64)> {
         self.parts_under(point).map(|(piece, _, height_m)| (piece, height_m))
@@ -348,7 +427,7 @@ impl Road {
             if !wanted(piece.surface) {
                 continue;
             }
-            let (distance_m, height_m) = piece.nearest(part as usize, point);
+            let (distance_m, height_m) = piece.nearest(part as usize, WHOLE, point);
             if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
                 nearest = Some((distance_m, height_m));
             }

@@ -37,6 +37,7 @@ _LABEL_COLORS: dict[int, tuple[int, int, int]] = {
     11: (70, 70, 70),  # building
     12: (102, 102, 156),  # wall
     14: (180, 165, 180),  # guard rail
+    15: (150, 100, 100),  # bridge
     17: (153, 153, 153),  # pole
     21: (107, 142, 35),  # vegetation
     22: (152, 251, 152),  # terrain

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ipc_schema::{config::Config, world::VehicleState};
+use ipc_schema::{config::Config, pointcloud::STATIC_OBJECT, world::VehicleState};
 use sensor_daemon::sensors::{
     camera::{
         CameraModel, CameraParams, CameraScratch, CameraShot, CameraTargets, EventMemory, ImagePlanes, PastPoses,
@@ -217,9 +217,9 @@ pub fn measure(python: Option<&Path>, bench: &BenchSize) -> serde_json::Value {
 
 /// The triangles, their owners and the cameras of a frame.
 fn write_frame(directory: &Path, scene: &Scene, states: &[VehicleState], camera: &CameraModel, targets: &Targets) {
-    let (mut vertices, mut faces, buildings) = oracle::triangles(scene);
+    let (mut vertices, mut faces, objects) = oracle::triangles(scene);
     // The ground is the owner 0.
-    let mut owners: Vec<u32> = buildings.iter().map(|building| building + 1).collect();
+    let mut owners: Vec<u32> = objects.iter().map(|object| (object & !STATIC_OBJECT) + 1).collect();
     for (owner, state) in (1 + scene.buildings().len() as u32..).zip(&states[CAMERAS..]) {
         for part in lidar_city::parts(state) {
             box_of(state, part, &mut vertices, &mut faces);

@@ -2,7 +2,10 @@
 
 use std::ops::Range;
 
-use ipc_schema::{config::LidarConfig, pointcloud::Tag};
+use ipc_schema::{
+    config::LidarConfig,
+    pointcloud::{GROUND, Tag},
+};
 use sim_core::scene::{
     Scene,
     shape::{Point, cross, from_to},
@@ -11,7 +14,7 @@ use sim_core::scene::{
 use super::{
     flow::{PastPoses, PixelMotion},
     labels::SemanticLabel,
-    raster::MOST_EDGES,
+    raster::{GROUND_SURFACE, MOST_EDGES},
     surfaces::{SeenBody, SurfaceTable},
     view::{BodyBounds, CameraView, DrawList},
 };
@@ -244,6 +247,7 @@ impl StillBodies {
             }
             let number = *number as usize;
             let still = &self.solids.stills[number];
+            let is_deck = still.object == GROUND;
             let body = surfaces.body(SeenBody {
                 instance: still.object,
                 label: SemanticLabel::of_tag(still.word) as u8,
@@ -264,7 +268,11 @@ impl StillBodies {
             if !above && !below {
                 continue;
             }
-            let surface = surfaces.surface(body, [0.0, 0.0, if above { 1.0 } else { -1.0 }]);
+            let surface = match is_deck && above {
+                // The road is painted on it.
+                true => GROUND_SURFACE,
+                false => surfaces.surface(body, [0.0, 0.0, if above { 1.0 } else { -1.0 }]),
+            };
             for piece in &self.pieces[self.roofs[number].start as usize..self.roofs[number].end as usize] {
                 let corner = |place: u32| walls[place as usize].p_m;
                 cap(

@@ -25,6 +25,8 @@ pub enum SemanticLabel {
     Wall = 12,
     /// Cones and barriers: CityScapes' "guard rail".
     Barrier = 14,
+    /// Sides and underside of a bridge; its top has the classes of the road.
+    Bridge = 15,
     /// Lamp posts and signs.
     Pole = 17,
     /// Trees.
@@ -71,6 +73,9 @@ impl SemanticLabel {
             Self::Vegetation
         } else if is(Tag::ParkedVehicle) {
             Self::Car
+        } else if is(Tag::Ground) {
+            // The sides and the underside of a deck.
+            Self::Bridge
         } else {
             Self::Building
         }
@@ -121,6 +126,7 @@ impl SemanticLabel {
             Self::Sidewalk => [0.42, 0.41, 0.40],
             Self::RailTrack => [0.30, 0.27, 0.25],
             Self::Building => [0.58, 0.50, 0.43],
+            Self::Bridge => [0.52, 0.51, 0.50],
             Self::Wall => [0.50, 0.48, 0.45],
             Self::Barrier => [0.80, 0.35, 0.15],
             Self::Static | Self::Dynamic => [0.35, 0.35, 0.30],
@@ -140,7 +146,7 @@ impl SemanticLabel {
     }
 
     /// Every class.
-    pub const ALL: [Self; 22] = [
+    pub const ALL: [Self; 23] = [
         Self::Static,
         Self::Dynamic,
         Self::Road,
@@ -149,6 +155,7 @@ impl SemanticLabel {
         Self::Building,
         Self::Wall,
         Self::Barrier,
+        Self::Bridge,
         Self::Pole,
         Self::Vegetation,
         Self::Terrain,

@@ -135,7 +135,7 @@ fn surface(label: SemanticLabel, air_k: f64, sun: f64) -> (f64, f64) {
         L::LaneMarking | L::StopLine | L::Crossing => (air_k + 2.0 + 13.0 * sun, 0.92),
         L::Sidewalk => (air_k + 1.0 + 14.0 * sun, 0.94),
         L::RailTrack => (air_k + 1.0 + 16.0 * sun, 0.80),
-        L::Building | L::Wall => (air_k + 2.0 + 8.0 * sun, 0.93),
+        L::Building | L::Bridge | L::Wall => (air_k + 2.0 + 8.0 * sun, 0.93),
         L::Barrier | L::Pole | L::Static | L::Dynamic => (air_k + 8.0 * sun, 0.90),
         L::Vegetation => (air_k + 1.0 * sun, 0.97),
         L::Terrain => (air_k - 1.0 + 6.0 * sun, 0.96),

@@ -1,14 +1,14 @@
-//! Static solids: buildings and props as prisms, indexed by the cells of a grid.
+//! Static solids: buildings, props and slices of bridge decks as prisms, indexed by the cells of a grid.
 
 use std::ops::Range;
 
 use ipc_schema::{
     config,
-    pointcloud::{STATIC_OBJECT, Tag},
+    pointcloud::{GROUND, STATIC_OBJECT, Tag},
     props::{PROPS, PropClass, PropKind},
 };
 use sim_core::scene::{
-    Scene, Solid, SolidClass,
+    DeckSlice, Scene, Solid, SolidClass,
     shape::{Bounds, Point, distance, edges, from_to},
 };
 
@@ -62,6 +62,47 @@ pub(in crate::sensors) struct StillSolids {
     most_reach_m: f64,
 }
 
+/// A solid before it is indexed.
+struct StillShape {
+    object: u32,
+    word: u32,
+    outline_m: Vec<Point>,
+    z_m: [f64; 2],
+    bounds: Bounds,
+}
+
+impl StillShape {
+    fn of_solid(number: u32, solid: &Solid<'_>, bounds: Bounds, interest: &[bool]) -> Self {
+        let (outline_m, z_m, word) = match solid {
+            Solid::Building(building) => (building.outline_m.clone(), building.z_m(), tag(building.class) as u32),
+            Solid::Prop(prop) => {
+                let kind = PROPS.iter().position(|kind| kind == prop.kind);
+                let is_wanted = kind.is_some_and(|kind| interest[kind]);
+                let word = prop_tag(prop.kind.class) as u32 | if is_wanted { INTEREST } else { 0 };
+                (prop.body.corners().to_vec(), prop.body.z_m, word)
+            }
+        };
+        Self {
+            object: STATIC_OBJECT | number,
+            word,
+            outline_m,
+            z_m,
+            bounds,
+        }
+    }
+
+    /// A deck is ground above ground.
+    fn of_deck(deck: &DeckSlice) -> Self {
+        Self {
+            object: GROUND,
+            word: Tag::Ground as u32,
+            outline_m: deck.outline_m.to_vec(),
+            z_m: deck.z_m,
+            bounds: Bounds::of(deck.outline_m),
+        }
+    }
+}
+
 /// The wall between two corners; `None` if they coincide.
 pub(in crate::sensors) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
     let length_m = distance(p_m, q_m);
@@ -76,19 +117,19 @@ pub(in crate::sensors) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
 impl StillSolids {
     pub(in crate::sensors) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Self {
         let interest = interest(lidar);
-        let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
-            .zip(scene.bounds())
-            .map(|(number, bounds)| (number, scene.solid(number), bounds))
-            .collect();
+        let numbered = (0_u32..).zip(scene.bounds());
+        let solids =
+            numbered.map(|(number, bounds)| StillShape::of_solid(number, &scene.solid(number), bounds, &interest));
+        let all: Vec<StillShape> = solids.chain(scene.decks().iter().map(StillShape::of_deck)).collect();
         let mut solids = Self::empty(&all);
-        let cell = |bounds: &Bounds| solids.cell(centre(bounds));
-        let mut order: Vec<(usize, usize)> = (0..all.len()).map(|i| (cell(&all[i].2), i)).collect();
+        let mut order: Vec<(usize, usize)> = (0..all.len())
+            .map(|i| (solids.cell(centre(&all[i].bounds)), i))
+            .collect();
         order.sort_unstable();
         let mut starts = vec![0_u32; solids.columns * solids.rows + 1];
         for (cell, i) in order {
             starts[cell + 1] += 1;
-            let (number, solid, bounds) = &all[i];
-            solids.add(*number, solid, bounds, &interest);
+            solids.add(&all[i]);
         }
         for cell in 1..starts.len() {
             starts[cell] += starts[cell - 1];
@@ -97,10 +138,10 @@ impl StillSolids {
         solids
     }
 
-    fn empty(all: &[(u32, Solid<'_>, Bounds)]) -> Self {
-        let whole = all
-            .iter()
-            .fold(Bounds::EMPTY, |whole, (.., one)| whole.with(one.min_m).with(one.max_m));
+    fn empty(all: &[StillShape]) -> Self {
+        let whole = all.iter().fold(Bounds::EMPTY, |whole, one| {
+            whole.with(one.bounds.min_m).with(one.bounds.max_m)
+        });
         if all.is_empty() {
             return Self {
                 cell_m: CELL_M,
@@ -131,29 +172,19 @@ impl StillSolids {
         row * self.columns + column
     }
 
-    fn add(&mut self, number: u32, solid: &Solid<'_>, bounds: &Bounds, interest: &[bool]) {
+    fn add(&mut self, shape: &StillShape) {
         let begin = self.walls.len() as u32;
-        let (outline, z_m, word) = match solid {
-            Solid::Building(building) => (building.outline_m.clone(), building.z_m(), tag(building.class) as u32),
-            Solid::Prop(prop) => {
-                let kind = PROPS.iter().position(|kind| kind == prop.kind);
-                let is_wanted = kind.is_some_and(|kind| interest[kind]);
-                let word = prop_tag(prop.kind.class) as u32 | if is_wanted { INTEREST } else { 0 };
-                (prop.body.corners().to_vec(), prop.body.z_m, word)
-            }
-        };
-        self.walls.extend(edges(&outline).filter_map(|(p, q)| wall(p, q)));
-        let centre_m = centre(bounds);
-        let reach_m = outline
-            .iter()
-            .map(|corner| distance(*corner, centre_m))
-            .fold(0.0, f64::max);
+        self.walls
+            .extend(edges(&shape.outline_m).filter_map(|(p, q)| wall(p, q)));
+        let centre_m = centre(&shape.bounds);
+        let corners = shape.outline_m.iter();
+        let reach_m = corners.map(|corner| distance(*corner, centre_m)).fold(0.0, f64::max);
         self.most_reach_m = self.most_reach_m.max(reach_m);
         self.near.push([centre_m[0], centre_m[1], reach_m]);
         self.stills.push(StillSolid {
-            object: STATIC_OBJECT | number,
-            word,
-            z_m,
+            object: shape.object,
+            word: shape.word,
+            z_m: shape.z_m,
             walls: begin..self.walls.len() as u32,
             centre_m,
             reach_m,

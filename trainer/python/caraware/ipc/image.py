@@ -38,6 +38,7 @@ class Label(IntEnum):
     BUILDING = 11
     WALL = 12
     BARRIER = 14
+    BRIDGE = 15
     POLE = 17
     VEGETATION = 21
     TERRAIN = 22

@@ -24,6 +24,7 @@ BRIGHTNESS = {
     Label.DYNAMIC: 0.1,
     Label.WALL: 0.1,
     Label.BARRIER: 0.1,
+    Label.BRIDGE: 0.1,
     Label.POLE: 0.1,
     Label.VEGETATION: 0.2,
     Label.TERRAIN: 0.25,
