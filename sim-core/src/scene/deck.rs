@@ -49,6 +49,11 @@ fn spans_of(road: &Road, piece: &RoadPiece) -> Option<Vec<[f64; 2]>> {
     for (part, ends) in piece.shape_m.windows(2).enumerate() {
         let [a, b] = [ends[0], ends[1]].map(|[x, y, _]| [x, y]);
         let length_m = distance(a, b);
+        // Most roads have nothing below them anywhere near.
+        if !road.is_any_below(&piece.part_bounds(part), ends[0][2].max(ends[1][2]) - CLEARANCE_M) {
+            begin_m += length_m;
+            continue;
+        }
         let steps = (length_m / STEP_M).ceil().max(1.0) as u32;
         for step in 0..=steps {
             let share = f64::from(step) / f64::from(steps);

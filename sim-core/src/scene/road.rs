@@ -191,7 +191,7 @@ impl RoadPiece {
         self.half_width_m.map_or(1, |_| self.shape_m.len().saturating_sub(1))
     }
 
-    fn part_bounds(&self, part: usize) -> Bounds {
+    pub(super) fn part_bounds(&self, part: usize) -> Bounds {
         match self.half_width_m {
             Some(half_m) => Bounds::of(self.shape_m[part..=part + 1].iter().copied().map(flat)).grown(half_m + SEAM_M),
             None => Bounds::of(self.shape_m.iter().copied().map(flat)),
@@ -334,6 +334,23 @@ impl Road {
     #[must_use]
     pub fn decks(&self) -> &[DeckSlice] {
         &self.decks
+    }
+
+    /// True if a part that may be within `bounds` has a point below `height_m`.
+    pub(super) fn is_any_below(&self, bounds: &Bounds, height_m: f64) -> bool {
+        let is_below = |entry: &u32| {
+            let (piece, part) = self.parts[*entry as usize];
+            let piece = &self.pieces[piece as usize];
+            let corners = match piece.half_width_m {
+                Some(_) => &piece.shape_m[part as usize..=part as usize + 1],
+                None => &piece.shape_m[..],
+            };
+            corners.iter().any(|corner| corner[2] < height_m)
+        };
+        let mut found = false;
+        self.index
+            .visit_near(bounds, |entries| found |= entries.iter().any(is_below));
+        found
     }
 
     /// Height of the ground at `point`, metres: of the lowest road that it lies on, or of the nearest one within `reach_m`. Roads on decks
