@@ -13,7 +13,7 @@ from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Estimate, EvaluationResult
-from caraware.report.metrics import TrainingPoint
+from caraware.report.metrics import TrainingPoint, TrainingPoints
 from caraware.run.checkpoint import (
     Keeping,
     TrainingHistory,
@@ -309,7 +309,7 @@ def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
         TrainingPoint(7, 0.3, 0.1, {"error_m": 5.25, "raw_gnss_error_m": math.pi}, 1e4),
         TrainingPoint(2**40, 0.1, 0.2, {"error_m": math.nan, "raw_gnss_error_m": 6.0}, 0.0),
     ]
-    course = TrainingHistory(11, 1, 2, 6, 40, [evaluation], points)
+    course = TrainingHistory(11, 1, 2, 6, 40, [evaluation], TrainingPoints(points))
     ppo = fresh()
     written = save_checkpoint(tmp_path, ppo, Counters(1, 7, 0, 9), "0", Keeping(3), course)
     found = load_history(written)

@@ -4,12 +4,13 @@ import errno
 import json
 import logging
 import math
+import tracemalloc
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from caraware.report.metrics import Metrics, TrainingPoint
+from caraware.report.metrics import Metrics, TrainingPoint, TrainingPoints
 from caraware.run.storage import is_full, when_there_is_space, write_whole
 
 
@@ -91,6 +92,30 @@ def test_the_course_of_training_is_a_line_for_each_update_and_goes_on_after_a_re
     update(third, 50)
     third.close()
     assert [line["env_steps"] for line in lines_of(file)] == [50]
+
+
+def test_a_long_training_is_kept_in_little_memory() -> None:
+    def point(step: int) -> TrainingPoint:
+        metrics = {"error_m": step + 0.25, "raw_gnss_m": 0.1 * step, "ekf_m": math.inf}
+        return TrainingPoint(4096 * step, 0.5 / step, -1.0 * step, metrics, 1000.0 + step)
+
+    points = TrainingPoints()
+    assert (len(points), list(points), points.names) == (0, [], ())
+    points.append(point(1))
+    tracemalloc.start()
+    for step in range(2, 20_001):
+        points.append(point(step))
+    kept_bytes = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    # Seven numbers of eight bytes, and what an array reserves ahead.
+    assert kept_bytes < 20_000 * 64 * 1.2
+    assert len(points) == 20_000
+    assert (points[0], points[-1], points[1:3]) == (point(1), point(20_000), [point(2), point(3)])
+    assert [one.env_steps for one in points[:3]] == [4096, 8192, 12288]
+    with pytest.raises(IndexError):
+        points[20_000]
+    again = TrainingPoints(TrainingPoint.of_row(row, points.names) for row in points.rows().tolist())
+    assert list(again) == list(points)
 
 
 def test_events_that_cannot_be_written_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

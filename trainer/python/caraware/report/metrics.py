@@ -4,15 +4,18 @@ import json
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
+import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from caraware import _native
+from caraware.ipc.arrays import Float64Array
 from caraware.report.evaluation import EvaluationResult
 
 if TYPE_CHECKING:
@@ -56,6 +59,59 @@ class TrainingPoint:
         """The point whose `row(names)` this is."""
         env_steps, sigma, reward, *values, rate = row
         return cls(int(env_steps), sigma, reward, dict(zip(names, values, strict=True)), rate)
+
+
+class TrainingPoints(Sequence[TrainingPoint]):
+    """The points of a training, each as the numbers of its row: a learner that runs for days has millions of them."""
+
+    def __init__(self, points: Iterable[TrainingPoint] = ()) -> None:
+        self._names: tuple[str, ...] | None = None
+        self._width = 0
+        self._numbers = array("d")
+        for point in points:
+            self.append(point)
+
+    @classmethod
+    def of(cls, points: Iterable[TrainingPoint]) -> "TrainingPoints":
+        """The points, which are not copied if they are `TrainingPoints` already."""
+        return points if isinstance(points, cls) else cls(points)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the metrics, in the order of the rows."""
+        return self._names or ()
+
+    def rows(self) -> Float64Array:
+        """f64 [n, 4 + metrics]: `TrainingPoint.row` of every point; a copy."""
+        return np.array(self._numbers).reshape(-1, self._width) if self._width else np.empty((0, 0))
+
+    def append(self, point: TrainingPoint) -> None:
+        """Add a point, which has the metrics of the first one."""
+        if self._names is None:
+            self._names = tuple(point.metrics)
+        row = point.row(self._names)
+        self._width = len(row)
+        self._numbers.extend(row)
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self._numbers) // self._width if self._width else 0
+
+    def __repr__(self) -> str:
+        """All points."""
+        return f"TrainingPoints({list(self)!r})"
+
+    @overload
+    def __getitem__(self, place: int) -> TrainingPoint: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[TrainingPoint]: ...
+    def __getitem__(self, place: int | slice) -> TrainingPoint | list[TrainingPoint]:
+        """The point at a place, made anew, or those of a slice."""
+        if isinstance(place, slice):
+            return [self[number] for number in range(*place.indices(len(self)))]
+        number = range(len(self))[place]
+        row = self._numbers[number * self._width : (number + 1) * self._width]
+        return TrainingPoint.of_row(row, self.names)
 
 
 class DroppedOutput:
@@ -121,7 +177,7 @@ class Metrics:
 
     def __init__(self, folder: Path, task_metrics: Sequence[_native.Metric]) -> None:
         """`task_metrics` are those of the task (`Task.metrics`)."""
-        self.training: list[TrainingPoint] = []
+        self.training = TrainingPoints()
         self.evaluations: list[EvaluationResult] = []
         self._folder, self._task_metrics = folder, task_metrics
         self._purge_step: int | None = None
@@ -130,9 +186,9 @@ class Metrics:
         self._course = Course(folder.parent / COURSE, self.dropped)
         self._tick = 0
 
-    def resume(self, training: list[TrainingPoint], evaluations: list[EvaluationResult], env_steps: int) -> None:
+    def resume(self, training: Iterable[TrainingPoint], evaluations: list[EvaluationResult], env_steps: int) -> None:
         """Go on after `env_steps`: events that a predecessor recorded beyond are void."""
-        self.training, self.evaluations = list(training), list(evaluations)
+        self.training, self.evaluations = TrainingPoints(training), list(evaluations)
         self._purge_step = env_steps + 1
         self._course.resume(env_steps)
 

@@ -1,5 +1,6 @@
 """The two pictures of a run: the task's metric and exploration over training, as PNG files without a display."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +40,7 @@ CURVES = (
 
 
 def plot_headline(
-    folder: Path, metric: _native.Metric, training: list[TrainingPoint], evaluations: list[EvaluationResult]
+    folder: Path, metric: _native.Metric, training: Sequence[TrainingPoint], evaluations: list[EvaluationResult]
 ) -> None:
     """Mean of the task's headline metric in training and in evaluations, against the baselines, over env steps.
 
@@ -93,7 +94,7 @@ def _plot_evaluated(axes: Axes, evaluations: list[EvaluationResult], curve: _Cur
     )
 
 
-def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:
+def plot_sigma(file: Path, training: Sequence[TrainingPoint]) -> None:
     """Standard deviation of the policy and mean reward over env steps (the paper's figure 7)."""
     figure, axes = _figure("Exploration and reward")
     steps = [p.env_steps for p in training]
@@ -109,7 +110,7 @@ def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:
 
 
 def _last_reference(
-    training: list[TrainingPoint], evaluations: list[EvaluationResult], estimator: str, name: str
+    training: Sequence[TrainingPoint], evaluations: list[EvaluationResult], estimator: str, name: str
 ) -> float | None:
     """The newest value of a reference metric, which evaluations hold by its estimator."""
     if evaluations:

@@ -4,8 +4,8 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from caraware import _native
 from caraware.learn.config import TrainerConfig
 from caraware.learn.stored import MEMORY, RANDOM, SUPERVISED, LearnerShape, StoredLearner, StoredTensors
 from caraware.report.evaluation import EvaluationResult
-from caraware.report.metrics import TrainingPoint
+from caraware.report.metrics import TrainingPoint, TrainingPoints
 from caraware.run.manifest import (
     BEST,
     COURSE,
@@ -57,7 +57,7 @@ class TrainingHistory:
     evaluated_tick: int = -1
     """Newest tick of `evaluations`; -1 before the first."""
     evaluations: list[EvaluationResult] = field(default_factory=list)
-    training: list[TrainingPoint] = field(default_factory=list)
+    training: Sequence[TrainingPoint] = ()
     others: list[StreamPosition] = field(default_factory=list)
     """The environments after the first, which `Counters` and the fields above describe."""
     curriculum: dict[str, Any] = field(default_factory=dict)
@@ -145,11 +145,11 @@ def _save_all(
     merged = {name: beside.get(name, {}) | tensors.get(name, {}) for name in tensors | beside}
     files = {name: _write(temporary / name, save(_contiguous(named))) for name, named in merged.items()}
     if history is not None:
-        names = list(history.training[0].metrics) if history.training else []
-        rows = torch.tensor([point.row(names) for point in history.training], dtype=torch.float64)
-        files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
+        points = TrainingPoints.of(history.training)
+        files[POINTS] = _write(temporary / POINTS, save({"training": torch.from_numpy(points.rows())}))
         evaluations = [result.report() for result in history.evaluations]
-        rest = asdict(history) | {"training": names, "evaluations": evaluations}
+        rest = asdict(replace(history, training=(), evaluations=[]))
+        rest |= {"training": list(points.names), "evaluations": evaluations}
         files[COURSE] = _write(temporary / COURSE, json.dumps(rest).encode())
     manifest = Manifest(
         schema_version=SCHEMA_VERSION,
@@ -220,7 +220,7 @@ def load_history(checkpoint: Path) -> TrainingHistory:
     evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
     others = [StreamPosition(**position) for position in rest.pop("others", [])]
     names = rest.pop("training")
-    training = [TrainingPoint.of_row(row, names) for row in rows]
+    training = TrainingPoints(TrainingPoint.of_row(row, names) for row in rows)
     return TrainingHistory(**rest | {"evaluations": evaluations, "training": training, "others": others})
 
 
