@@ -276,9 +276,12 @@ fn ground_height_m(road: &Road, point: Point) -> f64 {
     if let Some(height_m) = road.flat_height_m() {
         return height_m;
     }
+    if let Some(height_m) = road.ground_under_m(point) {
+        return height_m;
+    }
     let mut reach_m = GROUND_REACH_M;
     while reach_m < GROUND_LIMIT_M {
-        if let Some(height_m) = road.ground_m(point, reach_m) {
+        if let Some(height_m) = road.nearest_ground_m(point, reach_m) {
             return height_m;
         }
         reach_m *= 2.0;

@@ -353,40 +353,26 @@ impl Road {
         found
     }
 
-    /// Height of the ground at `point`, metres: of the lowest road that it lies on, or of the nearest one within `reach_m`. Roads on decks
-    /// do not count.
-    pub(super) fn ground_m(&self, point: Point, reach_m: f64) -> Option<f64> {
-        let parts = self.index.at(point).iter().filter_map(|&entry| {
+    /// Height of the lowest road that `point` lies on, metres. Roads on decks do not count, here and in [`Road::nearest_ground_m`].
+    pub(super) fn ground_under_m(&self, point: Point) -> Option<f64> {
+        let heights = self.index.at(point).iter().filter_map(|&entry| {
             let (piece, part) = self.parts[entry as usize];
             let height_m = self.pieces[piece as usize].height_at(part as usize, point)?;
             (!self.is_deck(piece, part, point)).then_some(height_m)
         });
-        parts
-            .min_by(f64::total_cmp)
-            .or_else(|| self.nearest_ground_m(point, reach_m))
+        heights.min_by(f64::total_cmp)
     }
 
-    fn nearest_ground_m(&self, point: Point, reach_m: f64) -> Option<f64> {
-        let mut found = Vec::new();
-        self.index.near(&Bounds::about(point, reach_m), &mut found);
-        let mut nearest: Option<(f64, f64)> = None;
-        let mut offer = |piece: u32, part: u32, shares: [f64; 2]| {
-            let (distance_m, height_m) = self.pieces[piece as usize].nearest(part as usize, shares, point);
-            if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
-                nearest = Some((distance_m, height_m));
+    /// Height of the road nearest to `point` within `reach_m`, metres.
+    pub(super) fn nearest_ground_m(&self, point: Point, reach_m: f64) -> Option<f64> {
+        let nearest = self.nearest_of(point, reach_m, |piece, part, offer| match self.deck_spans.get(&piece) {
+            None => offer(WHOLE),
+            Some(spans) => {
+                let (begin_m, [a, b]) = self.segment(piece, part);
+                let off_decks = deck::off_decks(spans, begin_m, distance(a, b));
+                off_decks.into_iter().for_each(offer);
             }
-        };
-        for entry in found {
-            let (piece, part) = self.parts[entry as usize];
-            match self.deck_spans.get(&piece) {
-                None => offer(piece, part, WHOLE),
-                Some(spans) => {
-                    let (begin_m, [a, b]) = self.segment(piece, part);
-                    let shares = deck::off_decks(spans, begin_m, distance(a, b));
-                    shares.into_iter().for_each(|shares| offer(piece, part, shares));
-                }
-            }
-        }
+        });
         nearest.map(|(_, height_m)| height_m)
     }
 
@@ -435,19 +421,31 @@ impl Road {
     /// The piece nearest to `point` within `reach_m`: its distance, and its height at the nearest place, metres.
     #[must_use]
     pub fn nearest(&self, point: Point, reach_m: f64, wanted: impl Fn(SurfaceKind) -> bool) -> Option<(f64, f64)> {
+        self.nearest_of(point, reach_m, |piece, _, offer| {
+            if wanted(self.pieces[piece as usize].surface) {
+                offer(WHOLE);
+            }
+        })
+    }
+
+    /// The nearest of the shares of parts that `each` offers for each part within `reach_m`: its distance and its height there, metres.
+    fn nearest_of(
+        &self,
+        point: Point,
+        reach_m: f64,
+        each: impl Fn(u32, u32, &mut dyn FnMut([f64; 2])),
+    ) -> Option<(f64, f64)> {
         let mut found = Vec::new();
         self.index.near(&Bounds::about(point, reach_m), &mut found);
         let mut nearest: Option<(f64, f64)> = None;
         for entry in found {
             let (piece, part) = self.parts[entry as usize];
-            let piece = &self.pieces[piece as usize];
-            if !wanted(piece.surface) {
-                continue;
-            }
-            let (distance_m, height_m) = piece.nearest(part as usize, WHOLE, point);
-            if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
-                nearest = Some((distance_m, height_m));
-            }
+            each(piece, part, &mut |shares| {
+                let (distance_m, height_m) = self.pieces[piece as usize].nearest(part as usize, shares, point);
+                if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
+                    nearest = Some((distance_m, height_m));
+                }
+            });
         }
         nearest
     }
