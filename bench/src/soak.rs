@@ -35,6 +35,9 @@ const JUDGED_H: f64 = 0.5;
 const FILLING: f64 = 0.2;
 /// Largest growth of a process that is no fault, MiB per hour and handles per hour.
 const MOST_GROWTH: (f64, f64) = (1.0, 2.0);
+/// Time from one handover to the next. A trainer needs minutes until it has all that it keeps: a growth of 1 MiB an hour shows only in a
+/// life that is much longer.
+const HANDOVER_INTERVAL: Duration = Duration::from_secs(2400);
 const DEADLINE: Duration = Duration::from_secs(300);
 
 /// A process, or all of its kind, at one moment.
@@ -67,7 +70,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         false => (
             Duration::from_secs(60 * u64::from(options.minutes)),
             Duration::from_secs(10),
-            Duration::from_secs(900),
+            HANDOVER_INTERVAL,
         ),
     };
     let directory = BenchDirectory::new(NAME)?;
