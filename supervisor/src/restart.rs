@@ -1,8 +1,8 @@
 //! Decides when an ended process is started again.
 //!
-//! A watcher that had opened its ports is started again at once. One that had not is started after a growing pause, a limited
-//! number of times. A process that the run needs is started again after a pause that grows while it makes no progress; only ends of
-//! its own fault can make the supervisor give it up.
+//! A watcher that had opened its ports is started again at once. One that had not is started after a growing pause. A process that the
+//! run needs is started again after a pause that grows while it makes no progress. Only ends of its own fault can make the supervisor
+//! give one of them up.
 
 use std::{
     os::unix::process::ExitStatusExt as _,
@@ -12,8 +12,8 @@ use std::{
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1};
 
-/// Number of starts in a row, none of which opened its ports, after which a watcher is not started again.
-const MAX_VAIN_STARTS: u32 = 20;
+/// Ends of its own fault in a row, before which it did not open its ports, after which a watcher is not started again.
+const MAX_WATCHER_FAULTS: u32 = 20;
 /// Most restarts in a row without progress after ends of a process's own fault.
 pub const MAX_VAIN_FAULTS: u32 = 5;
 /// Signals that come from outside.
@@ -34,7 +34,7 @@ pub enum RestartVerdict {
     Postpone(Duration),
     /// Its start is postponed: decide again later.
     Wait,
-    /// Never start it again.
+    /// Never start it again. A watcher is given up once; later verdicts are to wait.
     GiveUp,
 }
 
@@ -43,25 +43,40 @@ pub enum RestartVerdict {
 pub struct WatcherRestarts {
     /// Starts in vain since the watcher last opened its ports.
     vain: u32,
+    /// Of these, those that ended by its own fault.
+    faults: u32,
     /// Time of the next start.
     due: Option<Instant>,
 }
 
 impl WatcherRestarts {
     /// Decides on the watcher, which has ended by `now`. `worked` is true if it had opened its ports.
-    pub fn verdict(&mut self, worked: bool, now: Instant) -> RestartVerdict {
+    pub fn verdict(&mut self, worked: bool, cause: EndCause, now: Instant) -> RestartVerdict {
+        let (is_new, was_given_up) = (self.due.is_none(), self.is_given_up());
         let due = *self.due.get_or_insert_with(|| {
-            self.vain = if worked { 0 } else { self.vain + 1 };
+            if worked {
+                (self.vain, self.faults) = (0, 0);
+            } else {
+                self.vain += 1;
+                self.faults += u32::from(cause == EndCause::OwnFault);
+            }
             now + pause(self.vain)
         });
-        if self.vain > MAX_VAIN_STARTS {
-            RestartVerdict::GiveUp
+        if self.is_given_up() {
+            match is_new && !was_given_up {
+                true => RestartVerdict::GiveUp,
+                false => RestartVerdict::Wait,
+            }
         } else if now < due {
             RestartVerdict::Wait
         } else {
             self.due = None;
             RestartVerdict::Start
         }
+    }
+
+    fn is_given_up(&self) -> bool {
+        self.faults > MAX_WATCHER_FAULTS
     }
 }
 
@@ -239,26 +254,59 @@ mod tests {
     }
 
     #[test]
-    fn a_watcher_that_works_is_restarted_however_often_it_is_killed() {
+    fn a_watcher_that_works_is_restarted_however_often_it_ends() {
         let (mut restarts, now) = (WatcherRestarts::default(), Instant::now());
-        assert!((0..1000).all(|_| restarts.verdict(true, now) == RestartVerdict::Start));
+        for cause in [EndCause::Kill, EndCause::OwnFault] {
+            assert!((0..1000).all(|_| restarts.verdict(true, cause, now) == RestartVerdict::Start));
+        }
+    }
+
+    /// The verdict on the end of a watcher before it had opened its ports, after the longest pause.
+    fn after_vain_start(restarts: &mut WatcherRestarts, cause: EndCause, now: &mut Instant) -> RestartVerdict {
+        let verdict = restarts.verdict(false, cause, *now);
+        if verdict != RestartVerdict::Wait {
+            return verdict;
+        }
+        *now += LONGEST_PAUSE;
+        restarts.verdict(false, cause, *now)
     }
 
     #[test]
-    fn a_watcher_that_never_works_is_started_ever_less_often_and_given_up() {
+    fn a_watcher_that_is_killed_while_it_starts_is_started_ever_less_often_and_never_given_up() {
         let (mut restarts, mut now) = (WatcherRestarts::default(), Instant::now());
-        let begun = now;
-        for _ in 0..MAX_VAIN_STARTS {
-            assert_eq!(restarts.verdict(false, now), RestartVerdict::Wait);
-            now += LONGEST_PAUSE;
-            assert_eq!(restarts.verdict(false, now), RestartVerdict::Start);
+        assert_eq!(restarts.verdict(false, EndCause::Kill, now), RestartVerdict::Wait);
+        assert_eq!(
+            restarts.verdict(false, EndCause::Kill, now + PAUSE),
+            RestartVerdict::Start
+        );
+        assert_eq!(restarts.verdict(false, EndCause::Kill, now), RestartVerdict::Wait);
+        assert_eq!(
+            restarts.verdict(false, EndCause::Kill, now + PAUSE),
+            RestartVerdict::Wait
+        );
+        now += LONGEST_PAUSE;
+        assert_eq!(restarts.verdict(false, EndCause::Kill, now), RestartVerdict::Start);
+        for _ in 0..1000 {
+            assert_eq!(
+                after_vain_start(&mut restarts, EndCause::Kill, &mut now),
+                RestartVerdict::Start
+            );
         }
-        assert_eq!(restarts.verdict(false, now), RestartVerdict::GiveUp);
-        assert_eq!(restarts.verdict(false, now + LONGEST_PAUSE), RestartVerdict::GiveUp);
-        assert!(begun < now);
-        let mut again = WatcherRestarts::default();
-        assert_eq!(again.verdict(false, now), RestartVerdict::Wait);
-        assert_eq!(again.verdict(false, now + PAUSE), RestartVerdict::Start);
-        assert_eq!(again.verdict(true, now + PAUSE), RestartVerdict::Start);
+        assert_eq!(restarts.verdict(true, EndCause::Kill, now), RestartVerdict::Start);
+    }
+
+    #[test]
+    fn a_watcher_that_never_works_by_its_own_fault_is_given_up_once() {
+        let (mut restarts, mut now) = (WatcherRestarts::default(), Instant::now());
+        for _ in 0..MAX_WATCHER_FAULTS {
+            // Kills in between do not count.
+            for cause in [EndCause::OwnFault, EndCause::Kill] {
+                assert_eq!(after_vain_start(&mut restarts, cause, &mut now), RestartVerdict::Start);
+            }
+        }
+        assert_eq!(restarts.verdict(false, EndCause::OwnFault, now), RestartVerdict::GiveUp);
+        for later in [now, now + 2 * LONGEST_PAUSE] {
+            assert_eq!(restarts.verdict(false, EndCause::OwnFault, later), RestartVerdict::Wait);
+        }
     }
 }

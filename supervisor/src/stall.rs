@@ -30,7 +30,7 @@ pub struct LifeSign {
     pub queued: Duration,
     /// True until it is ready.
     pub is_starting: bool,
-    /// True while it may be silent: it is done, or its handover has a deadline of its own.
+    /// True while it may be silent: it is done, or its first start has a deadline of its own.
     pub is_excused: bool,
 }
 

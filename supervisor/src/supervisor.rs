@@ -303,6 +303,14 @@ impl Supervisor {
                 // The trainer has written all its results.
                 OnExit::Replace if ended.is_done => {}
                 OnExit::Replace if left => self.restart(index, &ended)?,
+                // A successor that was killed because it did not open its ports would not do so again either.
+                OnExit::Replace
+                    if self.handovers.is_opening()
+                        && self.killed_for_cause.contains(&(Process::Trainer, 0))
+                        && self.handovers.fall_back(&mut self.processes, index, &ended)? =>
+                {
+                    self.killed_for_cause.remove(&(Process::Trainer, 0));
+                }
                 OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
                 OnExit::Replace if self.handovers.fall_back(&mut self.processes, index, &ended)? => {}
                 // A reported failure would come again.
@@ -329,12 +337,10 @@ impl Supervisor {
 
     /// Reports processes that hang, and kills those that are to be replaced: their ends are found like all others.
     fn watch_stalls(&mut self) {
-        let is_handing_over = self.handovers.is_in_progress();
         let mut signs = self.processes.life_signs();
         for sign in &mut signs {
-            // The first start has a deadline of its own, and so has a handover.
+            // The first start has a deadline of its own.
             sign.is_excused |= sign.is_starting && self.ready_at.is_none();
-            sign.is_excused |= sign.place.0 == Process::Trainer && is_handing_over;
         }
         for change in self.stalls.check(Instant::now(), &signs) {
             match change {
@@ -347,6 +353,23 @@ impl Supervisor {
                     display::notice(&format!("{} continues", self.processes.label(place)));
                 }
             }
+        }
+        self.end_hanging_handover();
+    }
+
+    /// Ends a handover for which a trainer that hangs, and is not to be killed, has been asked to leave.
+    fn end_hanging_handover(&mut self) {
+        let place = (Process::Trainer, 0);
+        let silence = self.stalls.stalls().find(|(stalled, _)| *stalled == place);
+        let Some((_, silence)) = silence else { return };
+        if self.processes.run().config.run.on_stall == StallAction::Report && self.handovers.may_stay_with_trainer() {
+            let message = format!(
+                "the old trainer has made no progress for {:.0} s: it stays until it continues or is killed",
+                silence.as_secs_f64()
+            );
+            let help = "kill its process, which `caraware ps` shows, and its successor continues from the newest checkpoint; with \
+                        run.on_stall = \"replace\" the run does that itself";
+            self.handovers.refuse_current(&mut self.processes, &message, help);
         }
     }
 
@@ -448,18 +471,27 @@ impl Supervisor {
         Ok(true)
     }
 
-    /// Restarts a watcher, unless none of its last starts opened its ports. Then the run continues without it.
+    /// Restarts a watcher, unless it ended again and again by its own fault before it opened its ports. Then the run continues without it,
+    /// or ends if it needs it.
     fn restart_watcher(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         let place = (ended.row.process, ended.env_index);
+        let cause = self.cause_of(ended);
         let restarts = self.watcher_restarts.entry(place).or_default();
-        let verdict = restarts.verdict(self.processes.is_attached(index), Instant::now());
+        let verdict = restarts.verdict(self.processes.is_attached(index), cause, Instant::now());
         match verdict {
             RestartVerdict::Start => self.restart(index, ended),
             // The run would wait for ever for the credit of a process that never comes.
             RestartVerdict::GiveUp if ended.row.is_required(self.processes.run()) => {
                 Err(self.processes.failure(index, ended.status).into())
             }
-            _ => Ok(()),
+            RestartVerdict::GiveUp => {
+                let label = self.processes.label(place);
+                let note = format!("{label} ended again and again before it was ready: the run continues without it");
+                display::notice(&note);
+                self.processes.log(index, &note);
+                Ok(())
+            }
+            RestartVerdict::Wait | RestartVerdict::Postpone(_) => Ok(()),
         }
     }
 

@@ -24,7 +24,7 @@ use crate::{
     failure::Exit,
     handover::{
         claims::SuccessorClaims,
-        phases::{HandoverInProgress, write_run},
+        phases::{HandoverInProgress, write_successor_run_file},
         request::changed_config,
     },
     processes::{EndedProcess, RunProcesses},
@@ -138,7 +138,7 @@ impl Handovers {
     /// still getting ready; until then the trainer is not started again.
     ///
     /// # Errors
-    /// iceoryx2 refuses, or the run file cannot be written.
+    /// iceoryx2 refuses, or the run file cannot be written. A full disk is waited for.
     pub fn trainer_ended(
         &mut self,
         processes: &mut RunProcesses,
@@ -177,7 +177,7 @@ impl Handovers {
         processes.set_handing_over(true);
         processes.set_incarnation(successor.row, 0, successor.incarnation)?;
         processes.wake_sensing();
-        write_run(&run, "run.json")?;
+        run.rewrite()?;
         let RunFile {
             config, config_hash, ..
         } = processes.run().clone();
@@ -192,7 +192,7 @@ impl Handovers {
     /// Starts the learner before a successor again that has ended before its first commit. Returns false if there is none.
     ///
     /// # Errors
-    /// The run file cannot be written, or the learner cannot be started.
+    /// The run file cannot be written, or the learner cannot be started. A full disk is waited for.
     pub fn fall_back(
         &mut self,
         processes: &mut RunProcesses,
@@ -213,7 +213,7 @@ impl Handovers {
             config_hash,
             ..processes.run().clone()
         };
-        write_run(&run, "run.json")?;
+        run.rewrite()?;
         phases::remove(&Failure::path(&run.run_dir, ended.row.process.name()));
         processes.return_to(run);
         if let Some(handover) = self.current.take() {
@@ -281,16 +281,17 @@ impl Handovers {
         self.current = None;
     }
 
-    /// True while a handover is in progress.
-    #[must_use]
-    pub fn is_in_progress(&self) -> bool {
-        self.current.is_some()
-    }
-
     /// True while a successor opens its ports.
     #[must_use]
     pub fn is_opening(&self) -> bool {
         self.current.as_ref().is_some_and(HandoverInProgress::is_opening)
+    }
+
+    /// True while the old trainer is asked to leave, and a handover may be refused: of trainers that learn together one cannot stay alone.
+    #[must_use]
+    pub fn may_stay_with_trainer(&self) -> bool {
+        let current = self.current.as_ref();
+        current.is_some_and(|handover| handover.is_leaving() && !handover.is_together())
     }
 
     /// True if the end of the trainer is expected.
@@ -322,7 +323,7 @@ fn start_successor(
         config,
         ..processes.run().clone()
     };
-    let run_file = write_run(&run, phases::SUCCESSOR_RUN_FILE)?;
+    let run_file = write_successor_run_file(&run)?;
     let (successor, output) = processes.start_successor(&run, &run_file, request)?;
     let incarnation = successor.incarnation;
     let (sender, ready_line) = channel();

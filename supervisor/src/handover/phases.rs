@@ -80,7 +80,7 @@ impl HandoverInProgress {
     pub fn misfit(&self, journal_first: u64) -> Option<String> {
         let line = self.ready_line.try_recv().ok()?;
         match SuccessorClaims::of_line(&line)? {
-            Ok(claims) => claims.check(&self.run, journal_first).err(),
+            Ok(claims) => claims.check(&self.run.config, journal_first).err(),
             Err(error) => Some(format!("it reports what cannot be read: {error}")),
         }
     }
@@ -124,6 +124,8 @@ impl HandoverInProgress {
     }
 
     /// The reason of a failed handover: the successor ended, or it was not ready or the old trainer had not left in time.
+    ///
+    /// A trainer that hangs is found by the watch on stalls, also one that opens its ports.
     pub fn failure(&mut self) -> Option<Failure> {
         let asked = self.request.timeout_s.map(Duration::from_secs_f64);
         let (successor, limit, what) = match &mut self.phase {
@@ -188,6 +190,12 @@ impl HandoverInProgress {
     #[must_use]
     pub fn is_getting_ready(&self) -> bool {
         matches!(self.phase, HandoverPhase::GettingReady { .. })
+    }
+
+    /// True while the old trainer, which has been asked to leave, has not left.
+    #[must_use]
+    pub fn is_leaving(&self) -> bool {
+        matches!(self.phase, HandoverPhase::Leaving { .. })
     }
 
     /// True while the old trainer of a ready successor may be asked to leave.
@@ -259,12 +267,12 @@ pub fn remove_successor_run_file(run: &RunFile) {
     remove(&run.run_dir.join(SUCCESSOR_RUN_FILE));
 }
 
-/// Writes a run file to `run_dir/<name>` atomically, and returns its path.
+/// Writes the run file that a successor is started with atomically, and returns its path.
 ///
 /// # Errors
-/// The run directory is not writable.
-pub fn write_run(run: &RunFile, name: &str) -> Result<PathBuf, Exit> {
-    let path = run.run_dir.join(name);
+/// The run directory is not writable, or the disk is full.
+pub fn write_successor_run_file(run: &RunFile) -> Result<PathBuf, Exit> {
+    let path = run.run_dir.join(SUCCESSOR_RUN_FILE);
     run.to_json()
         .map_err(std::io::Error::from)
         .and_then(|text| storage::write_whole(&path, text))

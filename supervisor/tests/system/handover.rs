@@ -662,6 +662,29 @@ fn a_successor_that_ends_after_the_go_is_replaced_by_the_learner_before_it() {
     assert_nothing_left(&workplace, "returned");
 }
 
+/// A successor has `run.ready_s` to open its ports, once the old trainer has left.
+#[test]
+fn a_successor_that_hangs_after_the_go_is_replaced_by_the_learner_before_it() {
+    let workplace = Workplace::new();
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let arguments = arguments("awaited", &[PACED, "run.ready_s=30"]);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    command.env("PYTHONPATH", format!("{}:{python}", workplace.path().display()));
+    let mut run = Run::spawn(&workplace, "awaited", command);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    ending_module(&workplace, "sleeps", "import time; time.sleep(1e6)");
+    let output = workplace.run(&["handover", "awaited", "--set", "trainer.module=sleeps"]);
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("the learner before it"), "{said}");
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let is_late = |line: &&str| line.starts_with("trainer was not ready within 30 s");
+    assert_eq!(said.lines().filter(is_late).count(), 1, "tried once: {said}");
+    assert_eq!(Result::of(&workplace, "awaited"), *undisturbed(&workplace));
+    assert_nothing_left(&workplace, "awaited");
+}
+
 #[test]
 fn a_successor_that_does_not_fit_the_run_is_refused_with_the_difference() {
     let workplace = Workplace::new();

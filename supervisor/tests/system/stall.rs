@@ -84,20 +84,7 @@ impl Run {
     }
 
     fn pid_of(&self, process: Process) -> Option<Pid> {
-        let run_file = self.run_dir.join("run.json").to_string_lossy().into_owned();
-        let mut entries = std::fs::read_dir("/proc").unwrap().flatten();
-        entries.find_map(|entry| {
-            let line = std::fs::read(entry.path().join("cmdline")).ok()?;
-            let line = String::from_utf8_lossy(&line).into_owned();
-            let program = match process {
-                Process::Trainer => line.contains("\0caraware.train\0"),
-                process => Path::new(line.split('\0').next()?).ends_with(process.name()),
-            };
-            let pid: i32 = entry.file_name().to_str()?.parse().ok()?;
-            (program && line.contains(&run_file))
-                .then(|| Pid::from_raw(pid))
-                .flatten()
-        })
+        pid_in(&self.run_dir, process)
     }
 
     fn end(mut self) -> String {
@@ -107,6 +94,24 @@ impl Run {
         assert!(status.success(), "{status}\n{said}");
         said
     }
+}
+
+/// The process of the run in `run_dir`, by its command line.
+fn pid_in(run_dir: &Path, process: Process) -> Option<Pid> {
+    let run_file = run_dir.join("run.json").to_string_lossy().into_owned();
+    let mut entries = std::fs::read_dir("/proc").unwrap().flatten();
+    entries.find_map(|entry| {
+        let line = std::fs::read(entry.path().join("cmdline")).ok()?;
+        let line = String::from_utf8_lossy(&line).into_owned();
+        let program = match process {
+            Process::Trainer => line.contains("\0caraware.train\0"),
+            process => Path::new(line.split('\0').next()?).ends_with(process.name()),
+        };
+        let pid: i32 = entry.file_name().to_str()?.parse().ok()?;
+        (program && line.contains(&run_file))
+            .then(|| Pid::from_raw(pid))
+            .flatten()
+    })
 }
 
 /// Bytes of what was learnt.
@@ -193,6 +198,79 @@ fn a_stopped_fan_out_recorder_or_v2x_is_named_and_replaced_and_nothing_changes()
     ];
     let processes = [Process::Fanout, Process::Recorder, Process::V2x];
     assert_replaced(&settings, &processes);
+}
+
+/// What is made again is shown as such, and the learner's process stays.
+#[test]
+fn ticks_that_are_made_again_are_named_in_the_progress_and_the_learner_stays() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "stopped", &[PACED]);
+    run.until_consumed(300);
+    let [trainer, core, traffic] =
+        [Process::Trainer, Process::SimCore, Process::TrafficBridge].map(|process| run.pid_of(process).unwrap());
+    kill_process(core, Signal::KILL).unwrap();
+    let run_dir = run.run_dir.clone();
+    let next = until(&mut run.child, "another traffic-bridge", || {
+        let next = pid_in(&run_dir, Process::TrafficBridge)?;
+        (next != traffic).then_some(next)
+    });
+    // It loads its net for longer than this takes: no tick has been made again.
+    kill_process(next, Signal::STOP).unwrap();
+    run.until_said("[making ticks again]");
+    kill_process(next, Signal::CONT).unwrap();
+    assert_eq!(run.pid_of(Process::Trainer), Some(trainer));
+    let said = run.end();
+    assert!(said.contains("the simulation is made again from tick"), "{said}");
+    assert_same(&workplace, 1);
+}
+
+/// Asks for a handover in the background, and waits until its successor is being started.
+fn ask_for_handover(workplace: &Workplace, run: &mut Run) -> Child {
+    let mut command = workplace.command(&["handover", "stopped"]);
+    let client = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let successor = run.run_dir.join("run.next.json");
+    until(&mut run.child, "a successor", || successor.exists().then_some(()));
+    client
+}
+
+/// A handover excuses no trainer: one that hangs is killed, and its successor continues.
+#[test]
+fn a_successor_takes_over_from_a_trainer_that_hangs() {
+    let workplace = Workplace::new();
+    let settings = ["run.stall_s=5", "run.on_stall=replace", PACED];
+    let mut run = Run::start(&workplace, "stopped", &settings);
+    run.until_consumed(100);
+    let client = ask_for_handover(&workplace, &mut run);
+    kill_process(run.pid_of(Process::Trainer).unwrap(), Signal::STOP).unwrap();
+    run.until_said("trainer has made no progress for 5 s");
+    let output = client.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    run.end();
+    assert_same(&workplace, 0);
+    assert_eq!(
+        workplace.report("stopped")["handovers"].as_array().map(Vec::len),
+        Some(1)
+    );
+}
+
+/// Where a trainer that hangs is only reported, the handover ends with the reason.
+#[test]
+fn a_handover_from_a_trainer_that_hangs_is_refused_with_the_reason() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "stopped", &["run.stall_s=5", PACED]);
+    run.until_consumed(100);
+    let client = ask_for_handover(&workplace, &mut run);
+    let trainer = run.pid_of(Process::Trainer).unwrap();
+    kill_process(trainer, Signal::STOP).unwrap();
+    let output = client.wait_with_output().unwrap();
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("the old trainer has made no progress for"), "{said}");
+    assert!(said.contains("run.on_stall"), "{said}");
+    kill_process(trainer, Signal::CONT).unwrap();
+    run.end();
+    // It has been asked to leave, and does so once it can: a trainer with the same settings takes its place.
+    assert_same(&workplace, 1);
 }
 
 #[test]
