@@ -211,7 +211,8 @@ impl FoundCheckpoint {
         }
     }
 
-    /// Copies the checkpoint to the run in `run_dir`, and returns the beginning of that run, which continues from the copy.
+    /// Copies the checkpoint to the run in `run_dir`, and returns the beginning of that run, which continues from the copy. The copy has its
+    /// name once it is whole and flushed to disk.
     ///
     /// # Errors
     /// The checkpoint is not readable, or `run_dir` is not writable.
@@ -220,10 +221,17 @@ impl FoundCheckpoint {
         let folder = run_dir.join("checkpoints");
         let copy = folder.join(name);
         let failed = |error: std::io::Error| Exit::io("write", &copy, &error);
-        std::fs::create_dir_all(&copy).map_err(failed)?;
-        for entry in std::fs::read_dir(&self.checkpoint).map_err(failed)?.flatten() {
-            std::fs::copy(entry.path(), copy.join(entry.file_name())).map_err(failed)?;
-        }
+        let partial = folder.join(format!(".{}.partial", name.to_string_lossy()));
+        let copy_files = || {
+            std::fs::create_dir_all(&partial)?;
+            for entry in std::fs::read_dir(&self.checkpoint)? {
+                let entry = entry?;
+                storage::write_whole(&partial.join(entry.file_name()), std::fs::read(entry.path())?)?;
+            }
+            std::fs::rename(&partial, &copy)
+        };
+        copy_files().map_err(failed)?;
+        // This flushes the folder, too.
         storage::write_whole(&folder.join("latest"), name.as_encoded_bytes()).map_err(failed)?;
         Ok(Beginning {
             checkpoint: copy.clone(),

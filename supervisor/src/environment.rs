@@ -1,6 +1,6 @@
 //! One environment of a run in the supervisor: its directory, its services and its boards.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, time::Duration};
 
 use ipc_schema::{
     activity::Awaited,
@@ -147,7 +147,7 @@ impl Environment {
         };
         let start = Start {
             committed_ticks: start.committed_ticks.max(self.committed_ticks),
-            resets: resume::repeat_commands(&run.run_dir, &run.run_dir, start.episode_tick)?,
+            resets: resume::repeat_commands(&run.run_dir, &run.run_dir, start.episode_tick, Duration::MAX)?,
             ..start
         };
         self.run.restart = Some(RestartPoint {

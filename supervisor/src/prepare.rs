@@ -78,7 +78,15 @@ pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
     if let (Mode::Train, TrafficInput::Scenario(path, _)) = (mode, &named) {
         suggest_correction(&mut settings, &path.display().to_string());
     }
-    prepare_new(args, mode, settings.validate()?, named, &label, Install::find()?)
+    prepare_new(
+        args,
+        mode,
+        settings.validate()?,
+        named,
+        &label,
+        Install::find()?,
+        |_| Ok(()),
+    )
 }
 
 /// Checks a run in which the policy of a checkpoint predicts, and claims its directory and shared memory.
@@ -103,14 +111,15 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     // A player shows one environment, however many the policy has learnt in.
     config.run.envs = 1;
     let label = format!("{}-play", found.label());
-    let mut prepared = prepare_new(&args.run, Mode::Play, config, named, &label, install)?;
-    prepared.run.beginning = Some(Beginning {
-        checkpoint: found.checkpoint,
-        start: Start::default(),
-        others: Vec::new(),
-        episodes: args.episodes,
-    });
-    Ok(prepared)
+    prepare_new(&args.run, Mode::Play, config, named, &label, install, |run| {
+        run.beginning = Some(Beginning {
+            checkpoint: found.checkpoint,
+            start: Start::default(),
+            others: Vec::new(),
+            episodes: args.episodes,
+        });
+        Ok(())
+    })
 }
 
 /// Checks a run that continues from a checkpoint. It continues in its own directory if `resumed` names a run, and in a new directory
@@ -145,10 +154,11 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit
     }
     // A checkpoint is continued by a new run.
     let (_, named) = settings_of_run(&old, &[])?;
-    let mut prepared = prepare_new(args, Mode::Train, config, named, &found.label(), install)?;
-    let beginning = found.copy_into(&prepared.run.run_dir)?;
-    prepared.run.beginning = Some(resume::carry_over_logs(&old, &prepared.run.run_dir, beginning)?);
-    Ok(prepared)
+    prepare_new(args, Mode::Train, config, named, &found.label(), install, |run| {
+        let beginning = found.copy_into(&run.run_dir)?;
+        run.beginning = Some(resume::carry_over_logs(&old, &run.run_dir, beginning)?);
+        Ok(())
+    })
 }
 
 /// Prepares a stopped run to continue in its own directory, from `beginning` or, without it, from tick 0.
@@ -191,7 +201,7 @@ fn settings_of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, Tr
     Ok((settings, named))
 }
 
-/// Checks a run and creates its directory; without success it removes the directory.
+/// Checks a run and creates its directory, in which `begin` then puts what the run begins with; without success it removes the directory.
 fn prepare_new(
     args: &RunArgs,
     mode: Mode,
@@ -199,6 +209,7 @@ fn prepare_new(
     named: TrafficInput,
     label: &str,
     install: Install,
+    begin: impl FnOnce(&mut RunFile) -> Result<(), Exit>,
 ) -> Result<PreparedRun, Exit> {
     // Checks that leave no traces come first.
     system_limits::check_open_files(config.run.envs)?;
@@ -213,9 +224,10 @@ fn prepare_new(
     maps::locate(&mut config.curriculum)?;
     let command_logs = read_command_logs(args.commands.as_deref(), config.run.envs)?;
     prepare_in_new_directory(args, label, install, viewer, |run_dir, install| {
-        let assembled = assemble(run_dir, mode, config, install, named, scenario_map)?;
+        let (mut run, claim) = assemble(run_dir, mode, config, install, named, scenario_map)?;
         write_command_logs(&run_dir.path, &command_logs)?;
-        Ok(assembled)
+        begin(&mut run)?;
+        Ok((run, claim))
     })
 }
 

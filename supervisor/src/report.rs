@@ -19,6 +19,7 @@ use serde_json::{Map, Value, json};
 use crate::{
     failure::Exit,
     housekeeping::HousekeepingFigures,
+    resume,
     socket::HandoverReport,
     supervisor::{RunEnding, RunOutcome},
 };
@@ -312,6 +313,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "shortened_logs": housekeeping.shortened_logs,
     });
     report["layout_version"] = json!(LAYOUT_VERSION);
+    report["earlier_starts"] = json!(resume::earlier_starts(&run.run_dir));
     add_estimators(&mut report, metric, &trainer);
     let path = run.run_dir.join("report.json");
     let text = format!("{report:#}\n");

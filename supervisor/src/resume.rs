@@ -166,7 +166,7 @@ fn forget_all_decisions(old: &RunFile) -> Result<(), Exit> {
     }
     for index in 0..old.config.run.envs {
         let run_dir = old.environment(index).run_dir;
-        repeat_commands(&run_dir, &run_dir, 0)?;
+        repeat_commands(&run_dir, &run_dir, 0, Duration::ZERO)?;
     }
     Ok(())
 }
@@ -236,7 +236,9 @@ pub fn carry_over_logs(old: &RunFile, run_dir: &Path, mut beginning: Beginning) 
     // The curriculum is decided once for all environments.
     let stages = old.run_dir.join(CURRICULUM_LOG);
     if stages.exists() && old.run_dir != run_dir {
-        std::fs::copy(&stages, run_dir.join(CURRICULUM_LOG)).map_err(|error| Exit::io("copy", &stages, &error))?;
+        std::fs::read(&stages)
+            .and_then(|log| storage::write_whole(&run_dir.join(CURRICULUM_LOG), log))
+            .map_err(|error| Exit::io("copy", &stages, &error))?;
     }
     // Each environment has commands of its own.
     for index in 0..old.config.run.envs {
@@ -250,7 +252,7 @@ pub fn carry_over_logs(old: &RunFile, run_dir: &Path, mut beginning: Beginning) 
             index => beginning.others.get_mut(index as usize - 1),
         };
         let first_tick = start.as_ref().map_or(0, |start| start.episode_tick);
-        let resets = repeat_commands(&from, &to, first_tick)?;
+        let resets = repeat_commands(&from, &to, first_tick, Duration::ZERO)?;
         if let Some(start) = start {
             start.resets = resets;
         }
@@ -259,16 +261,16 @@ pub fn carry_over_logs(old: &RunFile, run_dir: &Path, mut beginning: Beginning) 
 }
 
 /// Makes the commands of the run in `from` that came at or after `first_tick` those that the run in `to` replays. Returns the number of
-/// episodes that earlier commands reset.
+/// episodes that earlier commands reset. Waits for at most `space_within` while the disk is full.
 ///
 /// # Errors
 /// A log cannot be read or written.
-pub fn repeat_commands(from: &Path, to: &Path, first_tick: u64) -> Result<u64, Exit> {
+pub fn repeat_commands(from: &Path, to: &Path, first_tick: u64, space_within: Duration) -> Result<u64, Exit> {
     let (done, due): (Vec<Action>, Vec<Action>) =
         commands(from)?.into_iter().partition(|action| action.tick < first_tick);
     // The replay is written first: if the program is killed between the two writes, no command is lost.
-    write_commands(&to.join(control::COMMAND_REPLAY), &due)?;
-    write_commands(&to.join(control::COMMAND_LOG), &done)?;
+    write_commands(&to.join(control::COMMAND_REPLAY), &due, space_within)?;
+    write_commands(&to.join(control::COMMAND_LOG), &done, space_within)?;
     let resets = done.iter().filter(|action| matches!(action.control, Command::Reset {}));
     Ok(resets.count() as u64)
 }
@@ -301,7 +303,7 @@ fn commands(run_dir: &Path) -> Result<Vec<Action>, Exit> {
 }
 
 /// Writes a log with these commands. Without commands it removes the file.
-fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
+fn write_commands(path: &Path, actions: &[Action], space_within: Duration) -> Result<(), Exit> {
     if actions.is_empty() {
         return match std::fs::remove_file(path) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(Exit::io("remove", path, &error)),
@@ -315,9 +317,11 @@ fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
         lines += "\n";
     }
     let directory = path.parent().unwrap_or(path);
-    std::fs::create_dir_all(directory)
-        .and_then(|()| storage::write_whole(path, lines))
-        .map_err(failed)
+    storage::wait_for_space(path, space_within, || {
+        std::fs::create_dir_all(directory)?;
+        storage::write_whole(path, &lines)
+    })
+    .map_err(failed)
 }
 
 /// The files that the run's traffic comes from.
@@ -335,8 +339,10 @@ fn sources(run: &RunFile) -> Vec<&Path> {
     }
 }
 
-/// Removes the files that a run writes at its end: its failures, the parts of its report, and the report.
+/// Removes the files that a run writes at its end: its failures, the parts of its report, and the report, of whose counters
+/// [`EARLIER_STARTS`] keeps those that begin at zero with each start.
 fn remove_end_reports(run_dir: &Path) -> Result<(), Exit> {
+    keep_counters(run_dir)?;
     let files = |folder: &str, end: &'static str| {
         let entries = std::fs::read_dir(run_dir.join(folder)).into_iter().flatten().flatten();
         entries
@@ -348,4 +354,56 @@ fn remove_end_reports(run_dir: &Path) -> Result<(), Exit> {
         std::fs::remove_file(&file).map_err(|error| Exit::io("remove", &file, &error))?;
     }
     Ok(())
+}
+
+/// The log of a run's earlier starts, each of which a later one has resumed: what their reports have counted.
+pub const EARLIER_STARTS: &str = "earlier_starts.jsonl";
+/// Keys of `report.json` that count from the start of the program, where others count from the beginning of the run.
+const OF_ONE_START: [&str; 11] = [
+    "result",
+    "failure",
+    "wall_s",
+    "ticks",
+    "restarts",
+    "handovers",
+    "drops",
+    "redelivered_ticks",
+    "journal_mib",
+    "disk_full",
+    "shortened_logs",
+];
+
+/// Adds the counters of `report.json`, if there is one, to [`EARLIER_STARTS`].
+fn keep_counters(run_dir: &Path) -> Result<(), Exit> {
+    let report = run_dir.join("report.json");
+    let Ok(text) = std::fs::read(&report) else {
+        return Ok(());
+    };
+    let path = run_dir.join(EARLIER_STARTS);
+    let failed = |error: std::io::Error| Exit::io("write", &path, &error);
+    // A damaged report has no counters.
+    let Ok(mut counters) = serde_json::from_slice::<serde_json::Map<String, serde_json::Value>>(&text) else {
+        return Ok(());
+    };
+    counters.retain(|key, _| OF_ONE_START.contains(&key.as_str()));
+    let line = serde_json::to_string(&counters).map_err(|error| failed(error.into()))? + "\n";
+    let mut starts = match std::fs::read_to_string(&path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => return Err(failed(error)),
+        starts => starts.unwrap_or_default(),
+    };
+    // A resumption that was killed before it had removed the report has added its counters already.
+    if !starts.ends_with(&line) {
+        starts += &line;
+        storage::write_whole(&path, starts).map_err(failed)?;
+    }
+    Ok(())
+}
+
+/// The counters of earlier starts, the oldest first. A start whose supervisor was killed has none.
+#[must_use]
+pub fn earlier_starts(run_dir: &Path) -> Vec<serde_json::Value> {
+    let text = std::fs::read_to_string(run_dir.join(EARLIER_STARTS)).unwrap_or_default();
+    text.lines()
+        .filter_map(|line| serde_json::from_str(line).ok())
+        .collect()
 }

@@ -135,6 +135,15 @@ fn a_resumed_run_ends_with_the_results_of_one_that_was_never_stopped() {
     );
     assert!(beginning["committed_ticks"].as_u64().unwrap() > beginning["episode_tick"].as_u64().unwrap());
     assert_eq!(outcome(&workplace, "cut"), expected);
+    // What counts from the start of the program is kept beside that.
+    let earlier = resumed["earlier_starts"].as_array().unwrap();
+    assert_eq!(earlier.len(), 1, "{resumed:#}");
+    assert_eq!(earlier[0]["result"], "interrupted");
+    assert_eq!(
+        (&earlier[0]["restarts"], &earlier[0]["handovers"]),
+        (&0.into(), &Value::Array(vec![]))
+    );
+    assert!(earlier[0]["wall_s"].as_f64().unwrap() > 0.0, "{resumed:#}");
 
     // A new run may begin at any checkpoint, and leaves the old run as it is.
     let before = crate::common::tree(&run_dir(&workplace, "whole"));
