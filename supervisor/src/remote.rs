@@ -3,8 +3,15 @@
 use std::{
     io::ErrorKind,
     net::{TcpListener, ToSocketAddrs as _},
-    os::unix::fs::PermissionsExt as _,
+    os::{
+        linux::net::SocketAddrExt as _,
+        unix::{
+            fs::PermissionsExt as _,
+            net::{SocketAddr, UnixListener},
+        },
+    },
     path::PathBuf,
+    sync::{Mutex, PoisonError},
 };
 
 use ipc_schema::config::{Commander, EndpointProtocol, FanoutConfig, FanoutEndpoint};
@@ -69,8 +76,13 @@ fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
             "if another run or program uses the port, choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
         )
     };
-    match TcpListener::bind(address) {
-        Ok(_) => Ok(()),
+    // A run that has just started may listen on the port in a moment.
+    let bound = match claim_address(&address) {
+        true => TcpListener::bind(&address).map(drop),
+        false => Err(ErrorKind::AddrInUse.into()),
+    };
+    match bound {
+        Ok(()) => Ok(()),
         Err(error) if error.kind() == ErrorKind::AddrInUse && listen.to_string() == DEFAULT_ENDPOINT => {
             let free = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
             let free = free.map_err(refuse)?;
@@ -86,6 +98,26 @@ fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
         }
         Err(error) => Err(refuse(error)),
     }
+}
+
+/// Claims an address of this machine for this program until it ends. False if another run has claimed it: its `fanout` listens there
+/// later than its supervisor checks the address.
+///
+/// The claim is an abstract socket: it holds for all users, leaves no file, and ends with the program however that ends.
+fn claim_address(address: &str) -> bool {
+    static CLAIM: Mutex<Option<(String, UnixListener)>> = Mutex::new(None);
+    let mut claim = CLAIM.lock().unwrap_or_else(PoisonError::into_inner);
+    if claim.as_ref().is_some_and(|(claimed, _)| claimed == address) {
+        return true;
+    }
+    let name = SocketAddr::from_abstract_name(format!("caraware-{address}"));
+    match name.and_then(|name| UnixListener::bind_addr(&name)) {
+        Ok(listener) => *claim = Some((address.to_owned(), listener)),
+        Err(error) if error.kind() == ErrorKind::AddrInUse => return false,
+        // Without claims the address itself decides.
+        Err(error) => tracing::debug!(%error, address, "cannot claim"),
+    }
+    true
 }
 
 /// True unless every address that the name resolves to is a loopback address.

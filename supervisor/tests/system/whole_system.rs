@@ -50,6 +50,9 @@ const LIGHT: [&str; 6] = [
     "episode.final_evaluations=1",
 ];
 
+/// No checkpoint but the last.
+const RARE: [&str; 2] = ["--set", "trainer.checkpoint_interval=1000000"];
+
 #[test]
 fn a_run_trains_reports_and_leaves_nothing_behind() {
     let workplace = Workplace::new();
@@ -296,10 +299,14 @@ fn a_simulator_that_always_crashes_ends_the_run_with_its_name_a_checkpoint_and_a
     let endless = ["--set", "episode.training_episodes=100000"];
     let mut run = Background::start(
         &workplace,
-        &small("train", "hit", &[&QUIET[..], &LIGHT, &endless].concat()),
+        &small("train", "hit", &[&QUIET[..], &LIGHT, &endless, &RARE].concat()),
     );
-    let checkpoint = workplace.path().join("runs/hit/checkpoints/latest");
-    eventually("a checkpoint", || checkpoint.is_file().then_some(()));
+    let updates = workplace.path().join("runs/hit/learning.jsonl");
+    eventually("an update", || {
+        std::fs::metadata(&updates).ok().filter(|file| file.len() > 0)
+    });
+    // The only checkpoint is that of a learner that was asked to commit.
+    assert!(!workplace.path().join("runs/hit/checkpoints/latest").exists());
     let here = workplace.path().join("runs/hit").to_string_lossy().into_owned();
     let status = eventually("the end of the run", || {
         for entry in std::fs::read_dir("/proc").unwrap().flatten() {
@@ -360,6 +367,57 @@ fn a_run_whose_traffic_cannot_start_says_so_in_its_report() {
     workplace.assert_nothing_left();
 }
 
+/// Two runs with one name, started at the same moment in two directories, with the default endpoint.
+#[test]
+fn two_runs_that_start_together_have_ports_of_their_own_and_are_told_apart() {
+    let workplace = Workplace::new();
+    let endless = ["--set", "episode.training_episodes=100000", "--runs"];
+    let mut runs = ["here", "there"].map(|runs| {
+        let arguments = small("simulate", "twin", &[&endless[..], &[runs]].concat());
+        Background::start(&workplace, &arguments)
+    });
+    let endpoints = ["here", "there"].map(|runs| {
+        let file = workplace.path().join(runs).join("twin/run.json");
+        eventually("a run that makes ticks", || {
+            let run_file = std::fs::read_to_string(&file).ok()?;
+            let table = text(&workplace.run(&["ps"]));
+            let is_whole = table.lines().filter(|line| line.contains("fanout")).count() == 2;
+            let run: Value = serde_json::from_str(&run_file).ok()?;
+            is_whole.then(|| run["config"]["fanout"]["listen"].as_str().unwrap().to_owned())
+        })
+    });
+    assert_ne!(endpoints[0], endpoints[1]);
+    for endpoint in &endpoints {
+        let address = endpoint.strip_prefix("tcp/").unwrap();
+        eventually("a fan-out that listens", || std::net::TcpStream::connect(address).ok());
+    }
+    // The name alone fits both. A directory means one of them.
+    for command in [
+        vec!["stop", "twin"],
+        vec!["control", "--run", "twin", "pause"],
+        vec!["view", "twin"],
+        vec!["handover", "twin"],
+    ] {
+        let output = workplace.run(&command);
+        assert_eq!(output.status.code(), Some(2), "{command:?}: {}", text(&output));
+        let said = text(&output);
+        assert!(
+            said.contains("several runs named `twin` are alive"),
+            "{command:?}: {said}"
+        );
+        assert!(
+            said.contains("here/twin") && said.contains("there/twin"),
+            "{command:?}: {said}"
+        );
+    }
+    workplace.succeed(&["stop", "there/twin"]);
+    assert_eq!(runs[1].0.wait().unwrap().code(), Some(130));
+    assert!(runs[0].0.try_wait().unwrap().is_none(), "the other lives");
+    workplace.succeed(&["stop", "twin"]);
+    assert_eq!(runs[0].0.wait().unwrap().code(), Some(130));
+    workplace.assert_nothing_left();
+}
+
 #[test]
 fn a_run_takes_a_free_port_if_the_default_one_is_in_use() {
     let workplace = Workplace::new();
@@ -384,14 +442,19 @@ fn a_closed_terminal_ends_the_run_with_a_checkpoint_and_a_report() {
     let endless = ["--set", "episode.training_episodes=100000"];
     let mut run = Background::start(
         &workplace,
-        &small("train", "hung", &[&QUIET[..], &LIGHT, &endless].concat()),
+        &small("train", "hung", &[&QUIET[..], &LIGHT, &endless, &RARE].concat()),
     );
     let latest = workplace.path().join("runs/hung/checkpoints/latest");
-    eventually("a checkpoint", || latest.is_file().then_some(()));
+    let updates = workplace.path().join("runs/hung/learning.jsonl");
+    eventually("an update", || {
+        std::fs::metadata(&updates).ok().filter(|file| file.len() > 0)
+    });
+    assert!(!latest.exists());
     drop((run.0.stdout.take(), run.0.stderr.take()));
     run.signal(Signal::HUP);
     assert_eq!(run.0.wait().unwrap().code(), Some(130));
     assert_eq!(workplace.report("hung")["result"], "interrupted");
+    assert!(latest.is_file(), "a checkpoint that was asked for");
     workplace.assert_nothing_left();
 }
 
