@@ -138,7 +138,8 @@ model: prerequisites $(VENV)/.installed ## the models and the parsers for longer
 	CARAWARE_FUZZ_FRAMES=100000000 $(CARGO) test $(CARGO_FLAGS) --test hostile_frames
 	CARAWARE_FUZZ_FRAMES=100000000 $(CARGO) test $(CARGO_FLAGS) --test messages
 	CARAWARE_FUZZ_FRAMES=1000000 $(CARGO) test $(CARGO_FLAGS) --test fanout a_flood
-	cd viewer && CARAWARE_FUZZ_FRAMES=7000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
+	CARAWARE_DAMAGED_COPIES=38 $(CARGO) test $(CARGO_FLAGS) --test system whole_program_survives
+	cd viewer && CARAWARE_FUZZ_FRAMES=1000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
 	$(MAKE) --no-print-directory miri
 	export MIRIFLAGS="-Zmiri-disable-data-race-detector -Zmiri-many-seeds=0..64"; $(MIRI) --features racing-board -- a_board_that
 

@@ -200,9 +200,34 @@ fn damaged_run_files_are_read_or_refused() {
     assert!(refused > 80, "{read} read, {refused} refused");
 }
 
-/// What the checks let pass goes to SUMO: the run ends by itself, with a message and an exit code of its own.
+/// Damaged copies of each file that the whole program reads in these tests; `make model` sets more.
+fn sample() -> u64 {
+    std::env::var("CARAWARE_DAMAGED_COPIES").map_or(3, |count| count.parse().unwrap())
+}
+
+/// Asserts that the whole program reads the damaged file at `path` or refuses it: by itself, in time, with the exit code `refusal` and a
+/// message with advice. It leaves nothing behind.
+fn assert_survives(workplace: &Workplace, arguments: &[&str], path: &Path, seed: u64, refusal: &[i32]) {
+    let begun = Instant::now();
+    let output = workplace.run(arguments);
+    let (said, name) = (text(&output), path.display());
+    let code = output
+        .status
+        .code()
+        .unwrap_or_else(|| panic!("{name}, seed {seed}: {}: {said}", output.status));
+    assert!(
+        code == 0 || refusal.contains(&code),
+        "{name}, seed {seed}: {code}: {said}"
+    );
+    assert!(!said.contains("panicked"), "{name}, seed {seed}: {said}");
+    assert!(code == 0 || said.contains("help:"), "{name}, seed {seed}: {said}");
+    assert!(begun.elapsed() < LIMIT, "{name}, seed {seed}: {said}");
+    workplace.assert_nothing_left();
+}
+
+/// What the checks let pass goes to SUMO, which may refuse it once the run has begun.
 #[test]
-fn the_whole_program_survives_a_sample() {
+fn the_whole_program_survives_damaged_scenarios() {
     let workplace = Workplace::new();
     let files = scenario_files(workplace.path());
     let settings = [
@@ -211,23 +236,66 @@ fn the_whole_program_survives_a_sample() {
         "fanout.enabled=false",
     ];
     let settings: Vec<&str> = settings.into_iter().flat_map(|setting| ["--set", setting]).collect();
+    let arguments = [&["simulate", "a.sumocfg", "--quiet"], &settings[..]].concat();
     for path in &files {
         let original = std::fs::read(path).unwrap();
-        for seed in 1000..1004 {
+        for seed in 1000..1000 + sample() {
             std::fs::write(path, Damage::new(seed).damaged(&original)).unwrap();
-            let begun = Instant::now();
-            let output = workplace.run(&[&["simulate", "a.sumocfg", "--quiet"], &settings[..]].concat());
-            let said = text(&output);
-            let code = output.status.code();
-            assert!(
-                matches!(code, Some(0..=3)),
-                "{}, seed {seed}: {code:?}: {said}",
-                path.display()
-            );
-            assert!(!said.contains("panicked"), "{}, seed {seed}: {said}", path.display());
-            assert!(begun.elapsed() < LIMIT, "{}, seed {seed}: {said}", path.display());
-            workplace.assert_nothing_left();
+            assert_survives(&workplace, &arguments, path, seed, &[1, 2]);
         }
         std::fs::write(path, original).unwrap();
     }
+}
+
+/// The files of a run that was stopped: each is what a resumption or a replay begins with.
+#[test]
+fn the_whole_program_survives_damaged_run_files_checkpoints_and_recordings() {
+    let workplace = Workplace::new();
+    let settings = [
+        "traffic.cavs=3",
+        "traffic.others=0",
+        "traffic.pedestrians=0",
+        "episode.ticks=60",
+        "episode.training_episodes=2",
+        "episode.evaluation_interval=0",
+        "episode.final_evaluations=1",
+        "episode.evaluation_ticks=20",
+        "trainer.horizon=90",
+        "trainer.batch_size=90",
+        "trainer.hidden=[8]",
+        "trainer.plots=false",
+        "trainer.checkpoints_kept=1",
+        "record.manner=lossless",
+        "fanout.enabled=false",
+    ];
+    let settings: Vec<&str> = settings.into_iter().flat_map(|setting| ["--set", setting]).collect();
+    workplace.succeed(&[&["train", "town", "--name", "whole", "--quiet"], &settings[..]].concat());
+    let run = workplace.path().join("runs/whole");
+    let newest = std::fs::read_to_string(run.join("checkpoints/latest")).unwrap();
+    let checkpoint = run.join("checkpoints").join(newest.trim());
+    let checkpoint = std::fs::read_dir(checkpoint)
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path());
+    let resume = &["train", "--resume", "whole", "--name", "next", "--quiet"][..];
+    let replay = &["replay", "whole", "--learn", "--name", "next", "--quiet"][..];
+    let files = checkpoint
+        .chain([run.join("checkpoints/latest"), run.join("run.json")])
+        .map(|path| (path, resume))
+        .chain([(run.join("recording.mcap"), replay)]);
+    let mut refused = 0;
+    for (path, arguments) in files {
+        let original = std::fs::read(&path).unwrap();
+        for seed in 2000..2000 + sample() {
+            std::fs::write(&path, Damage::new(seed).damaged(&original)).unwrap();
+            assert_survives(&workplace, arguments, &path, seed, &[1, 2]);
+            let next = workplace.path().join("runs/next");
+            match next.exists() {
+                true => std::fs::remove_dir_all(next).unwrap(),
+                false => refused += 1,
+            }
+        }
+        std::fs::write(path, original).unwrap();
+    }
+    assert!(refused > 0, "no damaged file was refused before a run was made");
 }
