@@ -39,10 +39,11 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "endurance",
         "Endurance",
         "Small runs are disturbed at random moments until each has completed: processes are killed (the supervisor too: then the run is \
-         resumed) or stopped for up to 1.5 s, trainers are replaced, viewers come, stop and die, the disk is full for up to 1.5 s. Each \
+         resumed), stopped for up to 1.5 s, or stopped until they are killed as hanging, trainers are replaced, viewers come, stop and die, the disk is full for up to 1.5 s. Each \
          is compared with the undisturbed run of the same seed. `town` has one environment, a step of 0.1 s and messages between \
-         vehicles; `grid` is a generated `.sumocfg` with a step of 1 s, two environments and a lossless recording. Not disturbed: the \
-         memory, the driving task.",
+         vehicles; `grid` is a generated `.sumocfg` with a step of 1 s, two environments and a lossless recording. In `learners` the \
+         town's trainer is replaced by another learner and back, and what was learnt is not compared. Not disturbed: the memory, the driving \
+         task.",
     );
     if disk.is_none() {
         report.text += " ";
@@ -53,7 +54,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         options.minutes, options.seed
     );
     let cases = EnduranceCase::all(&place.directory)?;
-    let mut counts = [EnduranceCounts::default(), EnduranceCounts::default()];
+    let mut counts = [(); 3].map(|()| EnduranceCounts::default());
     let mut undisturbed = Vec::new();
     for case in &cases {
         undisturbed.push(Outcome::of_undisturbed(&place, case)?);
@@ -66,7 +67,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             let name = format!("{}-{round}", case.name);
             let run = DisturbedRun::start(&place, case, &name, random.fork(), counts)?;
             if let Some(report) = run.disturb()? {
-                let outcome = Outcome::read(&place.run(&name), &report)?;
+                let outcome = Outcome::read(case, &place.run(&name), &report)?;
                 let differences = outcome.differences(whole);
                 let faults = differences.into_iter().map(|text| format!("run {name}: {text}"));
                 counts.faults.extend(faults);
@@ -106,7 +107,7 @@ struct Outcome {
     vehicle_steps: Value,
     lost_ticks: Value,
     duplicated_ticks: Value,
-    /// Bytes of the parameters, of Adam's moments and of the random numbers' states.
+    /// Bytes of the parameters, of Adam's moments and of the random numbers' states; none of learners that take turns.
     learnt: Vec<u8>,
 }
 
@@ -129,21 +130,16 @@ impl Outcome {
         let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         let report = serde_json::from_str(&text);
         let report = report.map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))?;
-        let outcome = Self::read(&place.run(&name), &report)?;
+        let outcome = Self::read(case, &place.run(&name), &report)?;
         remove(&place.run(&name))?;
         Ok(outcome)
     }
 
-    fn read(directory: &Path, report: &Value) -> Result<Self, Exit> {
-        let checkpoints = directory.join("checkpoints");
-        let read = |path: &Path| fs::read(path).map_err(|error| Exit::io("read", path, &error));
-        let newest = String::from_utf8_lossy(&read(&checkpoints.join("latest"))?)
-            .trim()
-            .to_owned();
-        let mut learnt = Vec::new();
-        for name in ["parameters", "optimiser", "random"] {
-            learnt.extend(read(&checkpoints.join(&newest).join(format!("{name}.safetensors")))?);
-        }
+    fn read(case: &EnduranceCase, directory: &Path, report: &Value) -> Result<Self, Exit> {
+        let learnt = match case.learners_take_turns {
+            true => Vec::new(),
+            false => learnt(&directory.join("checkpoints"))?,
+        };
         Ok(Self {
             result: report["result"].clone(),
             observation_hash: report["observation_hash"].clone(),
@@ -172,6 +168,19 @@ impl Outcome {
         }
         differences
     }
+}
+
+/// What the newest of these checkpoints holds.
+fn learnt(checkpoints: &Path) -> Result<Vec<u8>, Exit> {
+    let read = |path: &Path| fs::read(path).map_err(|error| Exit::io("read", path, &error));
+    let newest = String::from_utf8_lossy(&read(&checkpoints.join("latest"))?)
+        .trim()
+        .to_owned();
+    let mut learnt = Vec::new();
+    for name in ["parameters", "optimiser", "random"] {
+        learnt.extend(read(&checkpoints.join(&newest).join(format!("{name}.safetensors")))?);
+    }
+    Ok(learnt)
 }
 
 fn add_counts(report: &mut BenchReport, cases: &[EnduranceCase], counts: &[EnduranceCounts]) -> Result<(), Exit> {

@@ -100,17 +100,21 @@ fn disturbed_runs_end_as_if_nothing_had_happened() {
     assert_eq!(code, Some(0), "{text}");
     let report: serde_json::Value = serde_json::from_reader(file).unwrap();
     let figures = report["figures"].as_object().unwrap();
-    for (case, own) in [("town", "v2x"), ("grid", "recorder")] {
+    for (case, own) in [("town", Some("v2x")), ("grid", Some("recorder")), ("learners", None)] {
         assert_eq!(figures[&format!("{case}: runs completed")], 1.0, "{text}");
-        for process in [
+        let hung = figures
+            .keys()
+            .filter(|what| what.starts_with(&format!("{case}: ")) && what.ends_with(" hung"));
+        assert_eq!(hung.count(), 1, "{text}");
+        let processes = [
             "traffic-bridge",
             "sim-core",
             "sensor-daemon",
             "trainer",
             "fanout",
             "supervisor",
-            own,
-        ] {
+        ];
+        for process in processes.into_iter().chain(own) {
             let killed = figures.get(&format!("{case}: {process} killed"));
             assert_eq!(killed, Some(&1.0.into()), "{process}: {text}");
         }

@@ -1,4 +1,4 @@
-//! The runs that are disturbed: small ones of two kinds, so that many disturbances meet a start, an update, a commit or an evaluation.
+//! The runs that are disturbed: small ones of three kinds, so that many disturbances meet a start, an update, a commit or an evaluation.
 
 use std::{
     path::{Path, PathBuf},
@@ -9,8 +9,11 @@ use caraware::{failure::Exit, install::Install};
 
 use crate::target::Target;
 
-/// Settings of both cases: few road users, short episodes with evaluations between, a checkpoint after every second update.
-const SETTINGS: [&str; 6] = [
+/// Settings of all cases: few road users, short episodes with evaluations between, a checkpoint after every second update. A process that
+/// hangs is replaced soon.
+const SETTINGS: [&str; 8] = [
+    "run.stall_s=15",
+    "run.on_stall=replace",
     "episode.training_episodes=6",
     "episode.evaluation_interval=2",
     "trainer.horizon=600",
@@ -20,6 +23,14 @@ const SETTINGS: [&str; 6] = [
 ];
 const TOWN: [&str; 6] = [
     "v2x.share=0.5",
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=300",
+    "episode.evaluation_ticks=50",
+];
+/// The same without messages between vehicles.
+const LEARNERS: [&str; 5] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -53,16 +64,19 @@ pub struct EnduranceCase {
     settings: &'static [&'static str],
     /// Number of environments.
     pub envs: u32,
-    /// The process that the other case's runs do not have.
-    own: Target,
+    /// The process that the other cases' runs do not have, if there is one.
+    own: Option<Target>,
+    /// A handover goes to a learner of another kind and back, instead of to the same.
+    pub learners_take_turns: bool,
 }
 
 impl EnduranceCase {
-    /// The town with a step of 0.1 s, and in `directory` a generated `.sumocfg` with a step of 1 s and two environments.
+    /// The town with a step of 0.1 s, with one learner and with two in turn, and in `directory` a generated `.sumocfg` with a step of 1 s and
+    /// two environments.
     ///
     /// # Errors
     /// SUMO's programs are missing, or the directory is not writable.
-    pub fn all(directory: &Path) -> Result<[Self; 2], Exit> {
+    pub fn all(directory: &Path) -> Result<[Self; 3], Exit> {
         let sumocfg = generate(directory)?;
         Ok([
             Self {
@@ -70,14 +84,24 @@ impl EnduranceCase {
                 input: "town".into(),
                 settings: &TOWN,
                 envs: 1,
-                own: Target::V2x,
+                own: Some(Target::V2x),
+                learners_take_turns: false,
             },
             Self {
                 name: "grid",
                 input: sumocfg,
                 settings: &GRID,
                 envs: 2,
-                own: Target::Recorder,
+                own: Some(Target::Recorder),
+                learners_take_turns: false,
+            },
+            Self {
+                name: "learners",
+                input: "town".into(),
+                settings: &LEARNERS,
+                envs: 1,
+                own: None,
+                learners_take_turns: true,
             },
         ])
     }
@@ -85,7 +109,7 @@ impl EnduranceCase {
     /// True if its runs have such a process.
     #[must_use]
     pub fn has(&self, target: Target) -> bool {
-        self.own == target || !matches!(target, Target::V2x | Target::Recorder)
+        self.own == Some(target) || !matches!(target, Target::V2x | Target::Recorder)
     }
 
     /// Arguments that train on it as the run `name`, at `pace` simulated seconds per second (0: as fast as possible), with the fan-out

@@ -41,8 +41,10 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 const MOST_KEPT_BYTES: u64 = 4 << 20;
 /// Viewers at once.
 const VIEWERS: usize = 3;
+/// The learners that take turns: ours, and the one of docs/learners.md.
+const LEARNERS: [&str; 2] = ["caraware.train", "caraware.examples.minimal_learner"];
 /// What is done, and how many cards of the deck each has: a run draws them all.
-const DECK: [(Disturbance, usize); 12] = [
+const DECK: [(Disturbance, usize); 13] = [
     (Disturbance::Kill(Target::Trainer), 10),
     (Disturbance::Kill(Target::TrafficBridge), 3),
     (Disturbance::Kill(Target::SimCore), 3),
@@ -52,6 +54,7 @@ const DECK: [(Disturbance, usize); 12] = [
     (Disturbance::Kill(Target::Recorder), 3),
     (Disturbance::Kill(Target::Supervisor), 1),
     (Disturbance::Pause, 2),
+    (Disturbance::Hang, 1),
     (Disturbance::Handover, 2),
     (Disturbance::Viewer, 4),
     (Disturbance::FullDisk, 1),
@@ -64,7 +67,9 @@ enum Disturbance {
     Kill(Target),
     /// A process of any kind is stopped and continues later (SIGSTOP, SIGCONT).
     Pause,
-    /// Our trainer is replaced by its successor.
+    /// A process of the run is stopped until the supervisor has killed it.
+    Hang,
+    /// The trainer is replaced by its successor, or by a learner of another kind.
     Handover,
     /// A viewer is killed or stopped, and others are started.
     Viewer,
@@ -327,6 +332,7 @@ impl<'a> DisturbedRun<'a> {
             Disturbance::Kill(Target::Supervisor) => self.kill_supervisor(),
             Disturbance::Kill(target) => self.kill(target),
             Disturbance::Pause => self.pause_process(),
+            Disturbance::Hang => self.hang_process(),
             Disturbance::Handover => self.hand_over(),
             Disturbance::Viewer => self.disturb_viewers(),
             Disturbance::FullDisk => self.fill_disk(),
@@ -418,6 +424,30 @@ impl<'a> DisturbedRun<'a> {
         Ok(is_stopped)
     }
 
+    /// Stops a process that the supervisor starts, and waits until it has been killed and so can be replaced.
+    fn hang_process(&mut self) -> Result<bool, Exit> {
+        let target = Target::ALL[self.random.usize(0..Target::ALL.len())];
+        // While the run starts, the deadline is another.
+        if target == Target::Supervisor || self.sensed_ticks().iter().sum::<u64>() == 0 {
+            return Ok(false);
+        }
+        let hanging = self.random.choice(target.processes(&self.directory()));
+        let Some(hanging) = hanging.filter(|hanging| signal(*hanging, Signal::STOP)) else {
+            return Ok(false);
+        };
+        self.counts.count(format!("{} hung", target.name()));
+        let begun = Instant::now();
+        while target.processes(&self.directory()).contains(&hanging) && self.ended()?.is_none() {
+            if begun.elapsed() > DEADLINE {
+                self.fault(&format!("{} hung and was not killed", target.name()));
+                signal(hanging, Signal::CONT);
+                break;
+            }
+            pause();
+        }
+        Ok(true)
+    }
+
     /// Asks for a handover, after the next update or at once. It may be refused, for instance because the trainer was killed meanwhile.
     fn hand_over(&mut self) -> Result<bool, Exit> {
         if self.watched.is_none() {
@@ -426,6 +456,10 @@ impl<'a> DisturbedRun<'a> {
         let mut arguments = vec!["handover".to_owned(), self.name.clone()];
         if self.random.bool() {
             arguments.push("--now".into());
+        }
+        if self.case.learners_take_turns {
+            let module = self.other_learner()?;
+            arguments.extend(["--set".into(), format!("trainer.module={module}")]);
         }
         let client = self.place.command(&arguments).stderr(Stdio::piped()).spawn();
         let client = client.map_err(|error| Exit::io("start", &self.place.caraware, &error))?;
@@ -440,6 +474,14 @@ impl<'a> DisturbedRun<'a> {
             self.cards.insert(0, Disturbance::Handover);
         }
         Ok(true)
+    }
+
+    /// The learner's module that the run does not have now.
+    fn other_learner(&self) -> Result<&'static str, Exit> {
+        let run = RunFile::read(&self.directory().join("run.json"))
+            .map_err(|error| Exit::run(format!("the run file cannot be read: {error}"), ""))?;
+        let [ours, other] = LEARNERS;
+        Ok(if run.config.trainer.module == ours { other } else { ours })
     }
 
     /// Waits for the end of a handover. Returns false if it was not made.
@@ -594,7 +636,7 @@ fn draw_cards(place: &EndurancePlace, case: &EnduranceCase, random: &mut fastran
     let is_possible = |(disturbance, _): &(Disturbance, usize)| match disturbance {
         Disturbance::Kill(target) => case.has(*target),
         Disturbance::FullDisk => place.has_small_disk,
-        Disturbance::Pause | Disturbance::Handover | Disturbance::Viewer => true,
+        Disturbance::Pause | Disturbance::Hang | Disturbance::Handover | Disturbance::Viewer => true,
     };
     let of_kind = |(disturbance, count): (Disturbance, usize)| {
         std::iter::repeat_n(disturbance, if place.is_quick { 1 } else { count })
