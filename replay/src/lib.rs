@@ -54,7 +54,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 }
 
 fn unreadable(error: RecordingError) -> Failure {
-    Failure::from_error(FailureKind::Run, &error)
+    Failure::from_error(FailureKind::Run, &error).with_help(error.advice())
 }
 
 struct Player {

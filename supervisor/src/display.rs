@@ -1,6 +1,7 @@
 //! Live progress: a bar on a terminal, otherwise one line every few seconds.
 
 use std::{
+    collections::BTreeMap,
     io::{IsTerminal as _, Write as _},
     time::{Duration, Instant},
 };
@@ -103,7 +104,23 @@ pub struct ProgressDisplay {
     begin: Option<ProgressBegin>,
     /// Ticks of all environments, and since when they are so many.
     newest: Option<(u64, Instant)>,
+    boards: LastHealths,
     start: StartTimes,
+}
+
+/// What the boards said last. That of a process that starts again is empty: until its first tick what the one before it wrote is shown.
+#[derive(Debug, Default)]
+struct LastHealths(BTreeMap<(Process, u32), Health>);
+
+impl LastHealths {
+    fn newest(&mut self, process: Process, environment: &Environment) -> Health {
+        let health = environment.board(process).health();
+        let last = self.0.entry((process, environment.run.env_index)).or_insert(health);
+        if health.ticks > 0 {
+            *last = health;
+        }
+        *last
+    }
 }
 
 /// When a run reached the stages of its start, until its first update is reported.
@@ -165,6 +182,7 @@ impl ProgressDisplay {
             shares: PhaseShares::new(),
             begin: None,
             newest: None,
+            boards: LastHealths::default(),
             start: StartTimes::new(),
         }
     }
@@ -180,6 +198,7 @@ impl ProgressDisplay {
             shares: PhaseShares::new(),
             begin: None,
             newest: None,
+            boards: LastHealths::default(),
             start: StartTimes::new(),
         }
     }
@@ -219,7 +238,7 @@ impl ProgressDisplay {
     }
 
     fn view(&mut self, environments: &[Environment], ready_at: Option<Instant>, notes: &[String]) -> ProgressView {
-        let mut view = ProgressView::read(environments);
+        let mut view = ProgressView::read(environments, &mut self.boards);
         if ready_at.is_some() && view.all_ticks > 0 {
             let now = Instant::now();
             if self.newest.is_none_or(|(ticks, _)| ticks != view.all_ticks) {
@@ -311,11 +330,11 @@ struct ProgressView {
 
 impl ProgressView {
     /// Sums the boards of all environments. Tick, episode and simulated time are those of the slowest environment.
-    fn read(environments: &[Environment]) -> Self {
-        let all = |process: Process| {
+    fn read(environments: &[Environment], boards: &mut LastHealths) -> Self {
+        let mut all = |process: Process| {
             let healths = environments
                 .iter()
-                .map(|environment| environment.board(process).health());
+                .map(|environment| boards.newest(process, environment));
             healths.collect::<Vec<_>>()
         };
         // Health of every environment, by process.
@@ -463,7 +482,7 @@ mod tests {
     /// The boards of a resumed run begin with what was made before.
     #[test]
     fn the_rates_of_a_resumed_run_leave_out_what_was_made_before() {
-        let (mut view, at) = (ProgressView::read(&[]), Instant::now());
+        let (mut view, at) = (ProgressView::read(&[], &mut LastHealths::default()), Instant::now());
         (view.tick_s, view.steps, view.all_ticks) = (0.5, 1_000_500, 40_200);
         let begin = ProgressBegin {
             at,

@@ -27,14 +27,8 @@ const CHECK: Duration = Duration::from_millis(200);
 
 impl From<RecordingError> for Exit {
     fn from(error: RecordingError) -> Self {
-        let help = match &error {
-            RecordingError::Version { .. } => "read it with the program that wrote it",
-            RecordingError::Damaged { .. } => "what comes before that byte is in the file: cut it there, and it opens",
-            RecordingError::Foreign { .. } => "give the recording.mcap of a run",
-            RecordingError::Io { .. } | RecordingError::Format { .. } => "check the path and its permissions",
-        };
         let failure = ipc_schema::failure::Failure::from_error(ipc_schema::failure::FailureKind::Config, &error);
-        Self::Failure(failure.with_help(help))
+        Self::Failure(failure.with_help(error.advice()))
     }
 }
 

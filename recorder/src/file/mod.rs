@@ -147,6 +147,17 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
+    /// What the user can do about it.
+    #[must_use]
+    pub fn advice(&self) -> &'static str {
+        match self {
+            Self::Version { .. } => "read it with the program that wrote it",
+            Self::Damaged { .. } => "what comes before that byte is in the file: cut it there, and it opens",
+            Self::Foreign { .. } => "give the recording.mcap of a run",
+            Self::Io { .. } | Self::Format { .. } => "check the path and its permissions",
+        }
+    }
+
     /// True if the disk, or the user's share of it, is full.
     #[must_use]
     pub fn is_full(&self) -> bool {
