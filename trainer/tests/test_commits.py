@@ -1,6 +1,8 @@
 """The record of commits: whichever learners take turns, every tick is in exactly one committed update."""
 
+import errno
 import json
+import logging
 import os
 import random
 import shutil
@@ -9,11 +11,13 @@ from typing import Any
 
 import pytest
 from caraware.examples import minimal_learner
-from caraware.ipc.commits import COMMITS, Commit, CommitLog, CommitLogError, CommittedPosition
+from caraware.ipc.channel import Channel
+from caraware.ipc.commits import COMMITS, Commit, CommitLog, CommitLogError, CommittedPosition, EpisodeStarts
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.run.checkpoint import Keeping, TrainingHistory, load_checkpoint, load_history, save_checkpoint
 from caraware.run.continuation import Continuation, own_checkpoints, remove_uncommitted
 from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
+from full_disk import FullDisk, partial_files
 from synthetic import FIELDS, SIZE_M, locating_ppo, run_file
 
 
@@ -67,6 +71,75 @@ def test_a_learner_that_begins_earlier_takes_its_commits_back(tmp_path: Path) ->
     # Its checkpoint was renamed, but it died before the record of it.
     log.begin("ppo", at(180))
     assert (log.commits()[-1].learner, log.positions()[0].ticks) == ("ppo", 180)
+
+
+def test_a_commit_waits_for_space_and_leaves_nothing_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    record = CommitLog(run_file(str(tmp_path)))
+    record.record("ppo", at(100))
+    disk, before = FullDisk(monkeypatch, times=3), record.file.read_bytes()
+
+    def stop_requested() -> bool:
+        """Asked after every attempt that failed."""
+        assert (record.file.read_bytes(), partial_files(tmp_path)) == (before, [])
+        return False
+
+    with caplog.at_level(logging.WARNING):
+        record.record("other", at(200), stop_requested)
+    assert disk.refused == {".commits.json.partial": 3}
+    assert [(commit.learner, commit.positions[0].ticks) for commit in record.commits()] == [
+        ("ppo", 100),
+        ("other", 200),
+    ]
+    assert not partial_files(tmp_path)
+    assert [entry.getMessage().split(":")[0] for entry in caplog.records] == [
+        "the disk is full",
+        "there is space again",
+    ]
+    disk.refused.clear()
+    record.begin("ppo", at(150))
+    assert record.positions()[0].ticks == 150
+    assert disk.refused == {".commits.json.partial": 3}
+
+
+def test_a_stop_ends_the_wait_of_a_commit_which_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = CommitLog(run_file(str(tmp_path)))
+    record.record("ppo", at(100))
+    disk = FullDisk(monkeypatch, times=10**9)
+    with pytest.raises(OSError) as caught:
+        record.record("ppo", at(200), lambda: disk.refused.total() >= 4)
+    assert (caught.value.errno, disk.refused.total()) == (errno.ENOSPC, 4)
+    assert record.positions()[0].ticks == 100
+    assert not partial_files(tmp_path)
+
+
+class Attachment:
+    """The end of shared memory that a commit is published at."""
+
+    def __init__(self) -> None:
+        self.committed_ticks: list[int] = []
+
+    def committed(self, tick: int) -> None:
+        """Remember the commit."""
+        self.committed_ticks.append(tick)
+
+
+def test_the_commit_of_any_learner_is_published_once_there_is_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attachment, channel = Attachment(), object.__new__(Channel)
+    channel.learner, channel._commits = "other", CommitLog(run_file(str(tmp_path)))
+    channel._environment, channel._starts = 0, EpisodeStarts()
+    channel._attachment = attachment  # type: ignore[assignment]
+    disk = FullDisk(monkeypatch, times=2)
+
+    def stop_requested() -> bool:
+        assert attachment.committed_ticks == [], "the journal keeps what no record counts"
+        return False
+
+    channel.commit(49, stop_requested)
+    assert (disk.refused.total(), attachment.committed_ticks, channel.own_tick()) == (2, [49], 49)
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "another version"])

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from caraware.fusion.estimating import Estimating
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop, Recording
 from caraware.fusion.train import begin, player
+from caraware.ipc.commits import CommitLog
 from caraware.learn.config import ConfigError
 from caraware.run.checkpoint import Keeping, load_checkpoint, save_checkpoint
 from caraware.run.config import RunConfig
@@ -27,6 +28,7 @@ from caraware.run.continuation import Continuation
 from caraware.run.learner import Learner
 from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
 from caraware.run.player import PlayLoop
+from full_disk import FullDisk, partial_files
 from synthetic import SyntheticChannel
 from synthetic_vehicle import Track, VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 
@@ -220,6 +222,25 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     assert channel.is_done
     assert set(channel.predictions) == set(range(3 * 40))
     assert channel.committed_up_to == 2 * 40 - 1
+
+
+def test_a_full_disk_is_waited_for_and_a_stop_ends_the_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_it(folder: Path, stop_requested: Callable[[], bool]) -> SyntheticChannel:
+        run = street_run(folder, checkpoint_interval=1)
+        channel = SyntheticChannel(run, street_ticks(run, episodes=2))
+        config, learner, beginning = begin(run, SIZE, Continuation())
+        assert FusionLoop(channel, config, learner, beginning, stop_requested).run()
+        return channel
+
+    disk = FullDisk(monkeypatch, times=2)
+    assert run_it(tmp_path / "waits", lambda: False).committed_up_to == 2 * 40 - 1
+    assert {".commits.json.partial", ".latest.partial", ".trainer.json.partial", "manifest.json"} < set(disk.refused)
+    assert CommitLog(street_run(tmp_path / "waits")).positions()[0].ticks == 2 * 40
+    disk.refused.clear()
+    disk.fill()
+    with pytest.raises(OSError, match="No space left"):
+        run_it(tmp_path / "stops", lambda: disk.refused.total() >= 3)
+    assert not partial_files(tmp_path)
 
 
 def test_stopped_and_continued_it_ends_with_the_same_bytes_and_the_same_report(tmp_path: Path) -> None:

@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 import torch
 from caraware import train
+from caraware.ipc.commits import COMMITS, CommitLog
 from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import best_checkpoint, newest_sound_checkpoint, read_manifest
 from caraware.run.stream_position import TickLedger
+from full_disk import FullDisk, partial_files
 from safetensors.torch import load_file
 from synthetic import SyntheticChannel, SyntheticObservation, latest_checkpoint, run_file, street_ticks, with_evaluation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -67,6 +69,43 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     for name in ("error.png", "sigma.png"):
         assert (tmp_path / "plots" / name).read_bytes().startswith(PNG)
     assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+def test_a_run_on_a_disk_that_is_full_at_every_file_waits_and_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, full = tmp_path / "whole", tmp_path / "full"
+    loop_over(whole, with_evaluation(100, 20, 16, 5.0, seed=1), run=run_file(str(whole)))
+    disk = FullDisk(monkeypatch, times=2)
+    loop_over(full, with_evaluation(100, 20, 16, 5.0, seed=1), run=run_file(str(full)))
+    files = {".commits.json.partial", ".latest.partial", ".best.partial", ".trainer.json.partial", "manifest.json"}
+    assert files < set(disk.refused)
+    assert set(disk.refused.values()) == {2}
+    one, two = final_parameters(whole), final_parameters(full)
+    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
+    assert (full / COMMITS).read_bytes() == (whole / COMMITS).read_bytes()
+    assert part(full)["ppo_mean_error_m"] == part(whole)["ppo_mean_error_m"]
+    assert not partial_files(full)
+
+
+def test_a_stop_ends_the_wait_for_space_of_a_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wait that no stop ends would leave the supervisor nothing but SIGKILL."""
+    disk = FullDisk(monkeypatch, times=0)
+    record = CommitLog._write
+
+    def fill(*arguments: Any) -> None:
+        disk.fill()
+        record(*arguments)
+
+    monkeypatch.setattr(CommitLog, "_write", fill)
+    channel = SyntheticChannel(run_file(str(tmp_path)), with_evaluation(100, 20, 16, 5.0, seed=1))
+    config = RunConfig.from_run(channel.run)
+    with pytest.raises(OSError, match="No space left"):
+        TrainingLoop(channel, config, lambda: disk.refused.total() >= 3).run()
+    assert set(disk.refused) == {".commits.json.partial"}
+    assert channel.committed_up_to == -1
+    assert latest_checkpoint(tmp_path / "checkpoints").exists()
+    assert not partial_files(tmp_path)
 
 
 def test_a_run_without_plots_draws_none(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from caraware.learn.recurrent import RecurrentPpo
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.player import LIVE, PlayLoop, PlayTally
+from full_disk import FullDisk, partial_files
 from synthetic import SyntheticChannel
 from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 
@@ -109,6 +110,23 @@ def test_a_successor_continues_the_counts_of_the_file(tmp_path: Path) -> None:
         assert one[key] == two[key]
     for key in ("ppo_mean_error_m", "raw_gnss_mean_error_m", "ppo_ci95_m"):
         assert two[key] == pytest.approx(one[key], rel=1e-6)
+
+
+def test_a_play_waits_while_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    loop_over(tmp_path / "whole", ticks())
+    full = tmp_path / "full"
+    full.mkdir()
+    # The first attempt at the table fails, and removes the device in the place of its file.
+    (full / f".{LIVE}.partial").symlink_to("/dev/full")
+    disk = FullDisk(monkeypatch, times=2)
+    channel = loop_over(full, ticks())
+    assert disk.refused == {".trainer.json.partial": 2}
+    assert channel.committed_up_to == 2 * TICKS - 1
+    assert part(full) == part(tmp_path / "whole")
+    assert f"there is space again: {full / LIVE} is written" in caplog.messages
+    assert not partial_files(full)
 
 
 def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from caraware.ipc.storage import is_full, when_there_is_space, write_whole
 from caraware.report.metrics import Metrics, TrainingPoint, TrainingPoints
-from caraware.run.storage import is_full, when_there_is_space, write_whole
 
 
 def test_a_write_waits_for_space_and_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

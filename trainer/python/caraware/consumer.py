@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 from caraware import _native
+from caraware.ipc.report_part import write_entries
 
 
 def consume(attachment: _native.Attachment, stop: list[int]) -> dict[str, object]:
@@ -47,7 +48,7 @@ def main(run_file: str) -> None:
     attachment = _native.Attachment(run_file)
     part = consume(attachment, stop)
     run_dir = json.loads(attachment.run_json)["run_dir"]
-    Path(run_dir, "parts", "trainer.json").write_text(json.dumps(part) + "\n")
+    write_entries(Path(run_dir), part, lambda: bool(stop))
     attachment.done()
 
 

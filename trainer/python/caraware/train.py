@@ -47,12 +47,12 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
         _receive_the_rest(Channel(str(run_file), place=place), config, stop)
         return
     if meeting is not None:
-        _forget_uncommon(config.run_dir / "checkpoints", meeting)
+        _forget_uncommon(config.run_dir / "checkpoints", meeting, stop)
     learner = _successor(run_file, config, role, together) if role.replaces else _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     if learner is not None:
         positions = enumerate(position.committed() for position in learner.positions())
-        config.commits.begin(learner.shape().learner, dict(positions))
+        config.commits.begin(learner.shape().learner, dict(positions), lambda: stop.requested)
     channel = Channel(str(run_file), first_ticks[0], place=place)
     if place is not None:
         notes.board = channel
@@ -84,16 +84,16 @@ def _meeting(config: "RunConfig", role: HandoverRole, stop: StopSignal) -> "Meet
     return Meeting(Attendance(role.incarnation, role.handovers, names), lambda: stop.requested)
 
 
-def _forget_uncommon(folder: Path, meeting: "Meeting") -> None:
+def _forget_uncommon(folder: Path, meeting: "Meeting", stop: StopSignal) -> None:
     """Remove checkpoints that only some ranks have: an update counts when all ranks have committed it."""
     from caraware.run.checkpoint import remove_newer
     from caraware.run.manifest import BEGINNING, NEWEST
 
     if meeting.continues():
-        remove_newer(folder, meeting.common_checkpoint())
+        remove_newer(folder, meeting.common_checkpoint(), lambda: stop.requested)
     elif newest := os.environ.get(NEWEST):
         # The first trainers of runs that were resumed.
-        remove_newer(folder, None if newest == BEGINNING else newest)
+        remove_newer(folder, None if newest == BEGINNING else newest, lambda: stop.requested)
 
 
 def _receive_the_rest(channel: "Channel", config: "RunConfig", stop: StopSignal) -> None:

@@ -5,7 +5,6 @@ writes `teacher.safetensors` (observation f32 `[n, d]`, action f32 `[n, 2]`) and
 directory; `task.begin_from` names the latter for a policy that begins as the clone (docs/driving.md).
 """
 
-import json
 import logging
 import sys
 from collections import deque
@@ -20,6 +19,7 @@ from torch import Tensor
 from caraware.driving.lessons import Lessons, Limits
 from caraware.ipc.arrays import BoolArray, UInt32Array
 from caraware.ipc.channel import Channel, Observation
+from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import ConfigError, setting
 from caraware.learn.adam import ModuleAdam
 from caraware.learn.build import build_ppo, configure_torch
@@ -146,7 +146,7 @@ def imitate(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         "%d pairs; errors of the clone %s, of doing nothing %s", figures.pairs, figures.error, figures.error_of_zero
     )
     part = {"env_steps": teacher.pairs, "clone_error": figures.error, "zero_error": figures.error_of_zero}
-    (folder / "parts" / "trainer.json").write_text(json.dumps(part, indent=2) + "\n")
+    write_entries(folder, part, lambda: stop.requested)
     if ended:
         channel.done()
 

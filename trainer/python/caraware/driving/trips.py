@@ -6,7 +6,6 @@ that replace them drive on, and are not counted. `CARAWARE_DRIVER` names the dri
 `task.begin_from` names), `scripted`, `random`, or `sumo` (with `task.driver = "sumo"`).
 """
 
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from caraware.driving.manoeuvres import BETWEEN, Manoeuvres
 from caraware.examples import pure_pursuit
 from caraware.ipc.channel import Channel, Observation
 from caraware.ipc.names import Names
+from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import ConfigError, RunFile, config_table, setting
 from caraware.learn.build import build_ppo
 from caraware.learn.config import TrainerConfig
@@ -181,7 +181,7 @@ def drive_trips(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
             channel.consumed(obs.tick)
             ended, steps = obs.last, steps + int(obs.valid.sum())
     part = {"env_steps": steps, "driver": name, "trips": [asdict(trip) for trip in trips.trips]}
-    Path(run["run_dir"], "parts", "trainer.json").write_text(json.dumps(part) + "\n")
+    write_entries(Path(run["run_dir"]), part, lambda: stop.requested)
     if ended:
         channel.done()
 

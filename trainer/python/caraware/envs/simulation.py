@@ -24,6 +24,7 @@ import numpy as np
 
 from caraware.envs import outside
 from caraware.ipc.channel import Channel
+from caraware.ipc.report_part import write_entries
 from caraware.ipc.stream import Observation
 from caraware.run.program import ProgramError, caraware_program
 
@@ -272,8 +273,7 @@ class _Run:
         """Stops the run, unless it has ended."""
         self._queue.clear()
         if part is not None and self.process.poll() is None:
-            file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
-            file.write_text(json.dumps(part) + "\n")
+            write_entries(Path(self.channel.run["run_dir"]), part, lambda: self.process.poll() is not None)
         if self._ended:
             self.channel.done()
         self.channel.close()

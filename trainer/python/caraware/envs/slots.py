@@ -7,7 +7,6 @@ k + 1, which is that of another vehicle where a trajectory ended.
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 import warnings
@@ -37,6 +36,7 @@ from caraware.ipc.arrays import (
     UInt64Array,
 )
 from caraware.ipc.channel import StreamEndedError
+from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import setting
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
 from caraware.tasks.contract import Sampling
@@ -121,9 +121,7 @@ class GivenChannel:
         """Write the trainer's part of the report; say that all is done, if it is."""
         if part is not None:
             part = part | {"lost_ticks": self.lost_ticks, "duplicated_ticks": self.duplicated_ticks}
-            file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(part, indent=2) + "\n")
+            write_entries(Path(self.channel.run["run_dir"]), part)
         if self._last:
             # There will be no successor that could want old ticks.
             self.channel.committed(self._newest)

@@ -237,8 +237,16 @@ class FusionLoop:
             position, vehicles=self._vehicles, evaluations=self._metrics.evaluations, training=self._metrics.training
         )
         folder, keep = self._config.run_dir / "checkpoints", Keeping.of(self._config.trainer)
-        written = save_checkpoint(folder, self._learner, counters, self._config.config_sha256, keep, history)
-        self._config.commits.record(FUSION, {0: position.committed()})
+        written = save_checkpoint(
+            folder,
+            self._learner,
+            counters,
+            self._config.config_sha256,
+            keep,
+            history,
+            stop_requested=self._stop_requested,
+        )
+        self._config.commits.record(FUSION, {0: position.committed()}, self._stop_requested)
         self._saved_updates = self._learner.updates
         if position.committed_tick >= 0:
             self._channel.committed(position.committed_tick)
@@ -258,4 +266,5 @@ class FusionLoop:
             "untrained_env_steps": self._samples.env_steps - self._trained_steps,
             "seeds_m": self._seeds_m,
         }
-        write_part(self._config.run_dir, entries, self._metrics.evaluations, self._headline.name)
+        phases, headline = self._metrics.evaluations, self._headline.name
+        write_part(self._config.run_dir, entries, phases, headline, self._stop_requested)

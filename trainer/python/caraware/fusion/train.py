@@ -93,7 +93,7 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
         learner.updates = updates
     log.info("%d columns, %s, %s", COLUMNS, config.trainer, learner.fusion)
     position = beginning.history.first_position(beginning.counters).committed()
-    commits.begin(FUSION, {0: position})
+    commits.begin(FUSION, {0: position}, lambda: stop.requested)
     channel = SharedChannel(str(run_file), position.ticks)
     loop = FusionLoop(
         channel,

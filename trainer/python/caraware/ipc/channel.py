@@ -501,15 +501,16 @@ class Channel:
         """Gives the simulation credit for all ticks up to and including `tick`."""
         self._attachment.consumed(tick)
 
-    def commit(self, tick: int) -> None:
+    def commit(self, tick: int, stop_requested: Callable[[], bool] = lambda: False) -> None:
         """What this learner has learnt from all ticks up to and including `tick` is on disk: they never come again.
 
         This is the moment that counts: `commits.json` is renamed into place. Save first, under a name that has the
-        tick (`own_tick`), and remove older states afterwards. Raises `OSError` and `CommitLogError`.
+        tick (`own_tick`), and remove older states afterwards. Blocks while the disk is full, until there is space or
+        `stop_requested` says true; then it raises `OSError`. Raises `CommitLogError`.
         """
         episode, episode_tick = self._starts.after(tick)
         position = CommittedPosition(tick + 1, episode, episode_tick)
-        self._commits.record(self.learner, {self._environment: position})
+        self._commits.record(self.learner, {self._environment: position}, stop_requested)
         self.committed(tick)
 
     def own_tick(self) -> int | None:

@@ -6,13 +6,13 @@ newest entry is in exactly one committed update, whatever learners took turns. I
 
 import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from caraware.ipc.run_file import RunFile
+from caraware.ipc.storage import when_there_is_space, write_whole
 
 COMMITS = "commits.json"
 """In the run directory."""
@@ -97,7 +97,7 @@ class EpisodeStarts:
 
 
 class CommitLog:
-    """The commits of one run. Only the trainer at work writes them."""
+    """The commits of one run. Only the trainer at work writes them, and waits while the disk is full."""
 
     def __init__(self, run: RunFile) -> None:
         self.file = Path(run["run_dir"], COMMITS)
@@ -150,43 +150,51 @@ class CommitLog:
             begin = end
         return not commits or (commits[-1].learner == learner and ticks >= begin)
 
-    def record(self, learner: str, positions: Mapping[int, CommittedPosition]) -> None:
-        """Commit `positions` of some environments, from one moment to the next. Raises `OSError`, `CommitLogError`."""
+    def record(
+        self,
+        learner: str,
+        positions: Mapping[int, CommittedPosition],
+        stop_requested: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Commit `positions` of some environments, from one moment to the next. Raises `OSError`, `CommitLogError`.
+
+        On a full disk it waits until there is space, or until a stop is requested; then it raises `OSError`.
+        """
         commits = self.commits()
         newest = commits[-1].positions if commits else self._beginning
         commit = Commit(learner, tuple(positions.get(i, position) for i, position in enumerate(newest)))
         if commits and commits[-1].learner == learner:
             commits.pop()
-        self._write([*commits, commit])
+        self._write([*commits, commit], stop_requested)
 
-    def begin(self, learner: str, first_ticks: Mapping[int, CommittedPosition]) -> None:
+    def begin(
+        self,
+        learner: str,
+        first_ticks: Mapping[int, CommittedPosition],
+        stop_requested: Callable[[], bool] = lambda: False,
+    ) -> None:
         """`learner` continues from these positions: later ticks are not learnt, earlier ones are.
 
-        Raises `OSError` and `CommitLogError`.
+        It waits for space as `record` does. Raises `OSError` and `CommitLogError`.
         """
         ends = [first_ticks.get(i, position).ticks for i, position in enumerate(self.positions())]
         commits = self.commits()
         if any(end < position.ticks for end, position in zip(ends, self.positions(), strict=True)):
             cut = [Commit(commit.learner, _cut(commit.positions, ends)) for commit in commits]
-            self._write(list(_progressing(cut)))
+            self._write(list(_progressing(cut)), stop_requested)
         if any(end > position.ticks for end, position in zip(ends, self.positions(), strict=True)):
-            self.record(learner, first_ticks)
+            self.record(learner, first_ticks, stop_requested)
 
-    def _write(self, commits: list[Commit]) -> None:
+    def _write(self, commits: list[Commit], stop_requested: Callable[[], bool]) -> None:
         entries = [asdict(commit) for commit in commits]
         text = json.dumps({"schema_version": SCHEMA_VERSION, "sha256": _digest(entries), "commits": entries})
-        partial = self.file.with_name(f".{COMMITS}.partial")
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("w") as stream:
-            stream.write(text + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.rename(self.file)
-        folder = os.open(self.file.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        content = (text + "\n").encode()
+
+        def write() -> None:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self.file, content)
+
+        when_there_is_space(self.file, write, stop_requested)
 
 
 def _digest(entries: Any) -> str:

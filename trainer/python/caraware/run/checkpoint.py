@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from caraware import _native
+from caraware.ipc.storage import sync_directory, when_there_is_space, write_synced, write_whole
 from caraware.learn.config import TrainerConfig
 from caraware.learn.stored import MEMORY, RANDOM, SUPERVISED, LearnerShape, StoredLearner, StoredTensors
 from caraware.report.evaluation import EvaluationResult
@@ -35,7 +36,6 @@ from caraware.run.manifest import (
     read_manifest,
     verified,
 )
-from caraware.run.storage import sync_directory, when_there_is_space, write_synced, write_whole
 from caraware.run.stream_position import StreamPosition
 
 log = logging.getLogger(__name__)
@@ -136,32 +136,16 @@ def _save_all(
     history: TrainingHistory | None,
     of_other_ranks: StoredTensors | None,
 ) -> None:
-    """Write every file of a checkpoint under a temporary name, and rename it. Raises `OSError`."""
+    """Write every file of a checkpoint under a temporary name, and rename it. Raises `OSError`, and leaves nothing."""
     temporary = target.parent / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    # The tensors of the learner, and of ranks that learn with it.
-    tensors, beside = learner.tensors(), of_other_ranks or {}
-    merged = {name: beside.get(name, {}) | tensors.get(name, {}) for name in tensors | beside}
-    files = {name: _write(temporary / name, save(_contiguous(named))) for name, named in merged.items()}
-    if history is not None:
-        points = TrainingPoints.of(history.training)
-        files[POINTS] = _write(temporary / POINTS, save({"training": torch.from_numpy(points.rows())}))
-        evaluations = [result.report() for result in history.evaluations]
-        rest = asdict(replace(history, training=(), evaluations=[]))
-        rest |= {"training": list(points.names), "evaluations": evaluations}
-        files[COURSE] = _write(temporary / COURSE, json.dumps(rest).encode())
-    manifest = Manifest(
-        schema_version=SCHEMA_VERSION,
-        torch_version=torch.__version__,
-        config_sha256=config_sha256,
-        counters=counters,
-        schedules=learner.schedules(),
-        files=files,
-        **asdict(learner.shape()),
-    )
-    entries = asdict(manifest)
-    _write(temporary / MANIFEST, json.dumps(entries | {OWN_HASH: own_hash(entries)}, indent=2).encode())
+    try:
+        temporary.mkdir(parents=True)
+        _write_files(temporary, learner, counters, config_sha256, history, of_other_ranks)
+    except OSError:
+        # What was written of it takes space that is missing.
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
     # From one moment to the next it is there under its name.
     sync_directory(temporary)
     if target.exists():
@@ -173,10 +157,43 @@ def _save_all(
     sync_directory(target.parent)
 
 
-def mark_best(checkpoint: Path) -> None:
-    """Let `best` name this checkpoint; it stays until another is better."""
+def _write_files(
+    folder: Path,
+    learner: StoredLearner,
+    counters: Counters,
+    config_sha256: str,
+    history: TrainingHistory | None,
+    of_other_ranks: StoredTensors | None,
+) -> None:
+    """Write every file of a checkpoint into `folder`, the manifest last. Raises `OSError`."""
+    # The tensors of the learner, and of ranks that learn with it.
+    tensors, beside = learner.tensors(), of_other_ranks or {}
+    merged = {name: beside.get(name, {}) | tensors.get(name, {}) for name in tensors | beside}
+    files = {name: _write(folder / name, save(_contiguous(named))) for name, named in merged.items()}
+    if history is not None:
+        points = TrainingPoints.of(history.training)
+        files[POINTS] = _write(folder / POINTS, save({"training": torch.from_numpy(points.rows())}))
+        evaluations = [result.report() for result in history.evaluations]
+        rest = asdict(replace(history, training=(), evaluations=[]))
+        rest |= {"training": list(points.names), "evaluations": evaluations}
+        files[COURSE] = _write(folder / COURSE, json.dumps(rest).encode())
+    manifest = Manifest(
+        schema_version=SCHEMA_VERSION,
+        torch_version=torch.__version__,
+        config_sha256=config_sha256,
+        counters=counters,
+        schedules=learner.schedules(),
+        files=files,
+        **asdict(learner.shape()),
+    )
+    entries = asdict(manifest)
+    _write(folder / MANIFEST, json.dumps(entries | {OWN_HASH: own_hash(entries)}, indent=2).encode())
+
+
+def mark_best(checkpoint: Path, stop_requested: Callable[[], bool] = lambda: False) -> None:
+    """Let `best` name this checkpoint; it stays until another is better. It waits for space as `save_checkpoint`."""
     folder = checkpoint.parent
-    when_there_is_space(folder / BEST, lambda: _point(folder, BEST, checkpoint))
+    when_there_is_space(folder / BEST, lambda: _point(folder, BEST, checkpoint), stop_requested)
 
 
 def load_checkpoint(checkpoint: Path, learner: StoredLearner) -> Counters:
@@ -224,15 +241,18 @@ def load_history(checkpoint: Path) -> TrainingHistory:
     return TrainingHistory(**rest | {"evaluations": evaluations, "training": training, "others": others})
 
 
-def remove_newer(folder: Path, name: str | None) -> None:
-    """Remove checkpoints newer than `name`, or all: only some of the trainers that learn together have written them."""
+def remove_newer(folder: Path, name: str | None, stop_requested: Callable[[], bool] = lambda: False) -> None:
+    """Remove checkpoints newer than `name`, or all: only some of the trainers that learn together have written them.
+
+    It waits for space as `save_checkpoint`.
+    """
     newer = [checkpoint for checkpoint in folder.glob("update-*") if name is None or checkpoint.name > name]
     if not newer:
         return
     if name is None:
         (folder / LATEST).unlink(missing_ok=True)
     else:
-        _point(folder, LATEST, folder / name)
+        when_there_is_space(folder / LATEST, lambda: _point(folder, LATEST, folder / name), stop_requested)
     for checkpoint in newer:
         log.warning("%s was not written by all ranks, which continue from %s: removed", checkpoint.name, name)
         shutil.rmtree(checkpoint)

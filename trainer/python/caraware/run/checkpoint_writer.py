@@ -56,7 +56,7 @@ class CheckpointWriter:
         )
         log.info("checkpoint %s, learned up to tick %d", saved.name, progress.committed_tick)
         positions = [environment.progress.position().committed() for environment in self._environments]
-        self._commits.record(learner.shape().learner, dict(enumerate(positions)))
+        self._commits.record(learner.shape().learner, dict(enumerate(positions)), self._stop_requested)
         # Ticks may be forgotten when all ranks have written their checkpoints.
         self._ranks.gather(None)
         self.saved_updates = counters.updates
@@ -78,7 +78,7 @@ class CheckpointWriter:
 
     def mark_best(self, updates: int) -> None:
         """Let `best` name the checkpoint after so many updates."""
-        mark_best(self._folder / checkpoint_name(updates))
+        mark_best(self._folder / checkpoint_name(updates), self._stop_requested)
 
     def _of_other_ranks(self, learner: Learner) -> tuple[list[StreamPosition], StoredTensors]:
         """Positions of the other ranks' environments, states of their random numbers, and what networks remember.

@@ -16,7 +16,9 @@ from caraware.baselines import Ekf
 from caraware.baselines.samples import read_samples
 from caraware.ipc.arrays import BoolArray, Float32Array, FloatArray, UInt32Array, UInt64Array
 from caraware.ipc.names import Names
+from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import RunFile
+from caraware.ipc.storage import when_there_is_space
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.prediction import Predictor
 from caraware.report.statistics import mean_interval
@@ -179,10 +181,14 @@ class Scoreboard:
         }
 
     def write(self, file: Path) -> None:
-        """Replace the file, from one moment to the next."""
+        """Replace the file, from one moment to the next, without flushing it to disk. Raises `OSError`."""
         partial = file.with_name(f".{file.name}.partial")
-        partial.write_text(json.dumps({"table": self.table(), "tally": asdict(self.tally)}))
-        partial.rename(file)
+        try:
+            partial.write_text(json.dumps({"table": self.table(), "tally": asdict(self.tally)}))
+            partial.rename(file)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
 
 
 class FollowedScoreboard(Scoreboard):
@@ -273,12 +279,12 @@ class PlayLoop:
             self._channel.consumed(obs.tick)
 
     def _show(self) -> None:
-        """Write the file; the ticks in it need not be delivered again."""
+        """Write the file, once there is space on disk; the ticks in it need not be delivered again."""
         self._shown_at = time.monotonic()
         tally = self._board.tally
         if tally.tick < 0:
             return
-        self._board.write(self._live)
+        when_there_is_space(self._live, lambda: self._board.write(self._live), self._stop_requested)
         self._channel.committed(tally.tick)
         self._channel.report(
             episode=tally.episode,
@@ -307,6 +313,4 @@ class PlayLoop:
             part[mean_key(name, metric)] = tally.sums.mean(name)
             seeds = [episode[name] for episode in tally.episodes]
             part[interval_key(name, metric)] = mean_interval(seeds).half_width if len(seeds) > 1 else None
-        file = self._config.run_dir / "parts" / "trainer.json"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(part, indent=2) + "\n")
+        write_entries(self._config.run_dir, part, self._stop_requested)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-log = logging.getLogger("caraware.run.storage")
+log = logging.getLogger(__name__)
 
 RETRY_S = 0.1
 """Time between two attempts on a full disk."""
