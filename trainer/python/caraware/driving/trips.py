@@ -4,6 +4,9 @@ The list is fixed: in each evaluation episode of the run, whose seeds no trainin
 the beginning. Where they start, where they go, and what traffic is there at first follows from the seed alone. Heroes
 that replace them drive on, and are not counted. `CARAWARE_DRIVER` names the driver: `policy` (the parameters that
 `task.begin_from` names), `scripted`, `random`, or `sumo` (with `task.driver = "sumo"`).
+
+It may take a live run over from a learner, and leaves it to another at any tick. It learns nothing: what it has driven
+is committed when it leaves, because no learner can learn from actions that it did not draw.
 """
 
 import os
@@ -25,7 +28,7 @@ from caraware.ipc.run_file import ConfigError, RunFile, config_table, setting
 from caraware.learn.build import build_ppo
 from caraware.learn.config import TrainerConfig
 from caraware.run.learner import begin_from
-from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
+from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, read_run, run_process
 from caraware.tasks.driving import Driving
 from caraware.tasks.ends import name_of
 from caraware.tasks.table import task_of_run
@@ -160,8 +163,8 @@ DRIVERS: dict[str, Callable[[RunFile], Driver]] = {
 }
 
 
-def drive_trips(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
-    """Drive until the run ends; write the trips into the report's part."""
+def drive_trips(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
+    """Drive until the run ends or a successor waits; write the trips into the report's part."""
     run = read_run(run_file)
     name = os.environ.get(DRIVER, "policy")
     if name not in DRIVERS:
@@ -171,15 +174,19 @@ def drive_trips(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         raise ConfigError(f"`task.kind` is {task.name!r}", 'set task.kind = "driving"')
     torch.set_num_threads(1)
     driver, trips, ended = DRIVERS[name](run), TripLog(run, task), False
-    channel, steps = Channel(str(run_file)), 0
-    while not ended and not stop.requested:
+    if role.gets_ready and not role.wait_for_turn(SuccessorClaims(task=task.name, environments=1)):
+        return
+    channel, steps, answered = Channel(str(run_file)), 0, -1
+    while not (ended or stop.requested or stop.leave_requested):
         for obs in channel.receive(0.2):
             if obs.evaluation:
                 trips.add(obs)
             valid = torch.from_numpy(obs.valid).unsqueeze(1)
             channel.publish_actions(obs, torch.where(valid, driver(obs).clamp(-1, 1), 0.0).detach().numpy())
             channel.consumed(obs.tick)
-            ended, steps = obs.last, steps + int(obs.valid.sum())
+            ended, steps, answered = obs.last, steps + int(obs.valid.sum()), obs.tick
+    if stop.leave_requested and answered >= 0:
+        channel.commit(answered, lambda: stop.requested)
     part = {"env_steps": steps, "driver": name, "trips": [asdict(trip) for trip in trips.trips]}
     write_entries(Path(run["run_dir"]), part, lambda: stop.requested)
     if ended:
