@@ -140,7 +140,10 @@ def _save_all(
     temporary = target.parent / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        temporary.mkdir(parents=True)
+        if not target.parent.is_dir():
+            target.parent.mkdir(parents=True)
+            sync_directory(target.parent.parent)
+        temporary.mkdir()
         _write_files(temporary, learner, counters, config_sha256, history, of_other_ranks)
     except OSError:
         # What was written of it takes space that is missing.
@@ -151,10 +154,12 @@ def _save_all(
     if target.exists():
         # The name belongs to one of the two at any moment.
         _native.exchange(temporary, target)
+        # Before the old one loses a file: after a loss of power the name could still be the old one's.
+        sync_directory(target.parent)
         shutil.rmtree(temporary)
     else:
         temporary.rename(target)
-    sync_directory(target.parent)
+        sync_directory(target.parent)
 
 
 def _write_files(
