@@ -116,7 +116,7 @@ def test_a_driving_run_goes_to_a_script_to_another_learner_and_back() -> None:
             run.hand_over(OTHER)
             run.until(lambda: run.commits()[-1][0] == OTHER, "a commit of the other learner")
             run.hand_over(OURS)
-            report = run.report()
+            report, log = run.report(), run.log()
         finally:
             if run.process.poll() is None:
                 run.process.terminate()
@@ -132,4 +132,6 @@ def test_a_driving_run_goes_to_a_script_to_another_learner_and_back() -> None:
     # Our learner has all ticks of the run, of which others have learnt some.
     assert report["trainer"]["received_ticks"] == report["ticks"]
     assert report["trainer"]["duplicated_ticks"] == 0
+    # The other learner had driven on after its last commit: no update can learn from actions that it did not draw.
+    assert "were driven by another policy, and are not learnt from" in log
     assert report["dynamics"]["heroes"]["episodes"] >= 8

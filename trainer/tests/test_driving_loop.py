@@ -1,13 +1,17 @@
 """Our PPO learns to drive: in a world of one lane that listens to actions, with heroes that come and go."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from caraware.learn.rollout import Horizon
 from caraware.run.config import RunConfig
+from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
 from caraware.run.player import FollowedScoreboard, PlayTally
 from caraware.tasks import ends
@@ -206,6 +210,75 @@ def test_a_learner_learns_to_stay_in_its_lane_and_arrive_and_one_without_steps_d
     assert np.mean(rewards[-4:]) > np.mean(rewards[:4]) + 0.05, rewards
     _, still = drive(tmp_path / "stays", 1e-9)
     assert share(still) < 0.6, f"without steps nothing is learnt: {still}"
+
+
+class LaneTakenOver(Lane):
+    """The lane after another policy has driven there and has committed nothing: its ticks come again."""
+
+    def __init__(self, run: dict[str, Any], ticks: int, driven: int) -> None:
+        super().__init__(run, ticks)
+        self._again, self._consumed, rng = [], 0, np.random.default_rng(2)
+        for _ in range(driven):
+            (obs,) = super().receive(0.0)
+            self._again.append(obs)
+            super().publish_actions(obs, rng.uniform(-1, 1, (HEROES, 2)))
+
+    def receive(self, timeout_s: float) -> Sequence[LaneTick]:
+        """First what comes again, tick by tick."""
+        return [self._again.pop(0)] if self._again else super().receive(timeout_s)
+
+    def publish_actions(
+        self, observation: Any, actions: np.ndarray, policy_version: int = 0, *, now: bool = True
+    ) -> None:
+        """What was answered before is skipped."""
+        if observation.tick == self._tick:
+            super().publish_actions(observation, actions, policy_version, now=now)
+
+    def consumed(self, tick: int) -> None:
+        """Remember the credit."""
+        self._consumed = tick + 1
+
+    def actor_lag_ticks(self) -> int:
+        """The lane has made the tick that it waits with."""
+        return self._tick + 1 - self._consumed
+
+
+def learnt_ticks(folder: Path, monkeypatch: pytest.MonkeyPatch, *, follows_another: bool) -> tuple[list[int], int]:
+    """The ticks that a learner of a lane with 50 ticks of another learns from, and the first that it then commits."""
+    run = lane_run(folder, 1e-3)
+    config = RunConfig.from_run(run)
+    learner = Learner.begin(config, len(RANGES))
+    learner.follows_another = follows_another
+    learnt: list[int] = []
+    samples: list[int] = []
+    commits: list[int] = []
+    score = learner.ppo.score
+
+    def scored(horizon: Horizon, environment: int) -> Any:
+        learnt.extend(horizon.tick.tolist())
+        samples.append(horizon.samples())
+        return score(horizon, environment)
+
+    monkeypatch.setattr(learner.ppo, "score", scored)
+    lane = LaneTakenOver(run, 500, driven=50)
+    monkeypatch.setattr(lane, "committed", commits.append)
+    assert TrainingLoop(lane, config, lambda: False, learner=learner).run()
+    part = json.loads((folder / "parts" / "trainer.json").read_text())
+    assert (part["received_ticks"], part["lost_ticks"], part["duplicated_ticks"]) == (500, 0, 0)
+    assert part["env_steps"] - part["untrained_env_steps"] == sum(samples)
+    return learnt, commits[0]
+
+
+def test_nothing_is_learnt_from_ticks_that_another_policy_drove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learnt, committed = learnt_ticks(tmp_path / "other", monkeypatch, follows_another=True)
+    # Tick 50 was made but not answered; whether it was is not known.
+    assert learnt == list(range(51, 51 + len(learnt))) and len(learnt) > 300
+    assert committed == 50, "a successor receives only ticks that this learner drew"
+    # A learner that continues with its own parameters draws again what it drew.
+    learnt, _ = learnt_ticks(tmp_path / "own", monkeypatch, follows_another=False)
+    assert learnt == list(range(len(learnt))) and len(learnt) > 300
 
 
 def test_the_table_of_a_player_is_empty_when_an_episode_begins(tmp_path: Path) -> None:

@@ -37,6 +37,8 @@ class Environment:
         self.trips = TripCounts()
         """How the trips of heroes ended."""
         self._catches_up = True
+        self.answered_by_another = -1
+        """The newest tick whose actions another policy may have drawn: nothing is learnt up to it. -1: none."""
 
     def is_awaited(self, obs: Observation) -> bool:
         """Whether the world waits for the actions of a tick. Ticks that come again were answered by a predecessor.
@@ -51,12 +53,20 @@ class Environment:
         """f32 `[n, 2]`: the Kalman filter's positions (m, world), for viewers; None if it does not run."""
         return self._estimates.position_m(obs) if self._estimates else None
 
-    def start(self, position: StreamPosition, horizon: int, observation_size: int) -> None:
-        """Continue from `position`, collecting `horizon` samples for every update."""
+    def start(
+        self, position: StreamPosition, horizon: int, observation_size: int, *, follows_another: bool = False
+    ) -> None:
+        """Continue from `position`, collecting `horizon` samples for every update.
+
+        `follows_another`: another policy drove before. Of the ticks that come again, the world has gone on with its
+        actions, up to the newest that the process that waits for actions has finished.
+        """
         self.progress = StreamProgress(position)
         task = self._config.task
         sees = self._config.trainer.network is BuiltInNetwork.CNN
         drawn = task.actions.size if task.sampling is Sampling.EACH_TICK else 0
+        if drawn and follows_another:
+            self.answered_by_another = position.committed_tick + self.channel.actor_lag_ticks()
         self.rollout = Rollout(
             horizon,
             observation_size,

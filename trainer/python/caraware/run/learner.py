@@ -33,6 +33,8 @@ class Learner:
     """The baseline by regression, taught from the same batches."""
     counters: Counters
     history: TrainingHistory
+    follows_another: bool = False
+    """Whether other parameters drew the actions of the ticks that it begins with: another learner's, or older ones."""
 
     @classmethod
     def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
@@ -70,6 +72,7 @@ class Learner:
         if (counters, history) == (self.counters, self.history):
             return
         self.counters, self.history, self.ppo.updates = counters, history, counters.updates
+        self.follows_another = True
         # What the networks remember is of the ticks before those that others have learnt.
         self.ppo.restore_memory({})
 
@@ -78,6 +81,7 @@ class Learner:
         updates = self.ppo.updates
         load_checkpoint(checkpoint, self)
         self.ppo.updates = updates
+        self.follows_another = True
         # What another network remembers of other ticks says nothing about this run's.
         self.ppo.restore_memory({})
 

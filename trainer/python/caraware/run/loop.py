@@ -128,7 +128,8 @@ class TrainingLoop:
         for environment in self._environments:
             index = environment.index
             position = positions[index] if index < len(positions) else StreamPosition()
-            environment.start(position, share(trainer.horizon, count, index), size)
+            horizon, follows_another = share(trainer.horizon, count, index), learner.follows_another
+            environment.start(position, horizon, size, follows_another=follows_another)
             environment.episode = counters.episode
         if counters.updates > 0:
             self._checkpoints.saved_updates = counters.updates
@@ -221,6 +222,9 @@ class TrainingLoop:
         progress.starts.note(obs)
         samples = int(np.count_nonzero(obs.valid))
         self._vehicles = max(self._vehicles, samples)
+        if obs.tick <= environment.answered_by_another:
+            self._pass(environment, obs, samples, references)
+            return
         if obs.evaluation:
             environment.rollout.ended(obs)
             self._phases[environment.index].add(progress, obs, predicted_m, references, self._learner.supervised)
@@ -229,6 +233,21 @@ class TrainingLoop:
         self._samples.add(samples, references, learns=self._learns)
         if self._learns:
             environment.rollout.add(obs, drawn)
+
+    def _pass(
+        self, environment: Environment, obs: Observation, samples: int, references: Mapping[str, FloatArray]
+    ) -> None:
+        """Neither learn from a tick nor evaluate it: the world has gone on with what another policy drew.
+
+        The last of them is committed at once, so that a trainer that comes again receives only ticks that it drew.
+        """
+        if not obs.evaluation:
+            self._samples.add(samples, references, learns=False)
+        if obs.tick == environment.answered_by_another:
+            environment.progress.committed_tick = obs.tick
+            # The trainers of several ranks commit together, after their next update.
+            self._commit_due |= self._ranks.size == 1
+            log.info("ticks up to %d were driven by another policy, and are not learnt from", obs.tick)
 
     def _publish_actions(self, environment: Environment, obs: Observation, actions: Tensor) -> None:
         """Publish the actions of one tick, unless the world has gone on with what a predecessor drew."""
@@ -386,7 +405,7 @@ class TrainingLoop:
         return min(environment.episode for environment in self._environments)
 
     def _trained_steps(self) -> int:
-        """Samples that an update has learned from; others wait in the rollouts, or came when none could be filled."""
+        """Samples that an update has learned from; others wait in the rollouts, or are passed."""
         if self._learner is None:
             return 0
         pending = sum(environment.rollout.pending_samples() for environment in self._environments)

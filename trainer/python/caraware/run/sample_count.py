@@ -14,7 +14,7 @@ class SampleCount:
         self.env_steps = env_steps
         """Samples seen."""
         self.passed_steps = 0
-        """Those among them that came when no horizon could be filled any more."""
+        """Those among them that no update learns from: no horizon can be filled any more, or another policy drove."""
         self._references: dict[str, Mean] = {}
         self._clock = (time.monotonic(), env_steps)
 
