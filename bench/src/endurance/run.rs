@@ -148,10 +148,11 @@ impl EndurancePlace {
     }
 }
 
-/// The boards of `sensor-daemon` in all environments. They are opened while a run starts and kept until its end: a node that is opened
+/// The boards of `sensor-daemon` in all environments, and of the trainer. They are opened while a run starts and kept until its end: a node that is opened
 /// while a run ends would leave files behind.
 struct WatchedBoards {
     boards: Vec<BoardReader>,
+    trainer: BoardReader,
     _node: RunNode,
 }
 
@@ -162,6 +163,7 @@ impl WatchedBoards {
         let board = |env| BoardReader::open(&node, run, env, Process::SensorDaemon).ok();
         Some(Self {
             boards: (0..envs).map(board).collect::<Option<_>>()?,
+            trainer: BoardReader::open(&node, run, 0, Process::Trainer).ok()?,
             _node: node,
         })
     }
@@ -427,8 +429,9 @@ impl<'a> DisturbedRun<'a> {
     /// Stops a process that the supervisor starts, and waits until it has been killed and so can be replaced.
     fn hang_process(&mut self) -> Result<bool, Exit> {
         let target = Target::ALL[self.random.usize(0..Target::ALL.len())];
-        // While the run starts, the deadline is another.
-        if target == Target::Supervisor || self.sensed_ticks().iter().sum::<u64>() == 0 {
+        // A process that does not get ready when a run starts or resumes ends the run, so that no hang is found while a trainer starts.
+        let has_begun = |watched: &WatchedBoards| watched.trainer.progress().consumed_ticks > 0;
+        if target == Target::Supervisor || !self.watched.as_ref().is_some_and(has_begun) {
             return Ok(false);
         }
         let hanging = self.random.choice(target.processes(&self.directory()));
