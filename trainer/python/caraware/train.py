@@ -146,7 +146,6 @@ def _get_ready(run_file: Path, config: "RunConfig", role: HandoverRole) -> bool:
     found = Continuation.find(config.run_dir / "checkpoints", config.commits, PPO)
     Learner.begin(replace(config, resume_from=role.checkpoint or found.checkpoint), size).warm_up()
     claims = SuccessorClaims(
-        schema_version=_native.SCHEMA_VERSION,
         observation_size=size,
         task=config.task.name,
         action_size=config.task.actions.size,

@@ -70,7 +70,6 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
         found = Continuation.find(folder, commits, FUSION)
         begin(run, size, replace(found, checkpoint=role.checkpoint or found.checkpoint))
         claims = SuccessorClaims(
-            schema_version=_native.SCHEMA_VERSION,
             observation_size=size,
             task="localisation",
             environments=1,

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 
+from caraware import _native
 from caraware.ipc.run_file import RunFile
 
 log = logging.getLogger("caraware.train")
@@ -60,7 +61,8 @@ class StopSignal:
 class SuccessorClaims:
     """What a successor is made for: the supervisor refuses it where the run is another. None says nothing."""
 
-    schema_version: int | None = None
+    schema_version: int | None = _native.SCHEMA_VERSION
+    """Of the payloads that it reads, whatever else it says."""
     observation_size: int | None = None
     observation_fields: tuple[str, ...] | None = None
     action_size: int | None = None
