@@ -6,11 +6,9 @@
 #[allow(dead_code, reason = "each test file uses its own part")]
 mod harness;
 
-use std::time::Duration;
-
 use bytemuck::{bytes_of, pod_read_unaligned};
 use fanout::{frame::MAX_SENSOR_BYTES, network::keys::Topic, reader};
-use harness::{PATIENCE, Run, ask, header, next, publisher, send_census, send_world, until, watch};
+use harness::{PATIENCE, Run, ask, decoded, header, next, publisher, send_census, send_world, until, watch};
 use ipc_schema::{
     block::view_mut,
     config::Config,
@@ -111,10 +109,14 @@ fn an_image_goes_to_those_who_subscribe_while_they_do() {
     });
     assert_eq!(send_both(), [1, 1]);
     for _ in 0..3 {
-        // Long enough for the next image to be due.
-        std::thread::park_timeout(Duration::from_millis(150));
-        send_both();
-        let (header, payload) = next(&seen);
+        // Images that come before the next is due are not sent on.
+        let mut came = None;
+        until("another image", || {
+            send_both();
+            came = seen.try_recv().unwrap();
+            came.is_some()
+        });
+        let (header, payload) = decoded(&came.unwrap());
         let (layout, expected) = image(header.tick, 1, 84, 60);
         assert_eq!((header.shape, payload), (layout.shape, expected));
     }

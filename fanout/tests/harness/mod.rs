@@ -206,7 +206,11 @@ pub fn watch(session: &zenoh::Session, key: String) -> Subscriber<RingChannelHan
 
 /// The next frame, as header and payload.
 pub fn next(frames: &Subscriber<RingChannelHandler<Sample>>) -> (MessageHeader, Vec<u8>) {
-    let sample = frames.recv_timeout(PATIENCE).unwrap().expect("no frame came");
+    decoded(&frames.recv_timeout(PATIENCE).unwrap().expect("no frame came"))
+}
+
+/// A frame, as header and payload.
+pub fn decoded(sample: &Sample) -> (MessageHeader, Vec<u8>) {
     let bytes = sample.payload().to_bytes();
     let (header, payload) = fanout::frame::decode(&bytes).unwrap();
     (header, payload.to_vec())
