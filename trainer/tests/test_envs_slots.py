@@ -256,6 +256,35 @@ def test_reset_continues_to_the_next_episode_but_not_twice_without_a_step(tmp_pa
             env.reset(seed=seed)
 
 
+@dataclass
+class TakenOverChannel(DrivingChannel):
+    """A channel whose world has gone on for some ticks with what a predecessor answered."""
+
+    ahead: int = 0
+    first_tick: int = 0
+
+    def actor_lag_ticks(self) -> int:
+        """Ticks that the world has finished."""
+        return self.ahead
+
+
+@pytest.mark.parametrize(("ahead", "first"), [(0, 10), (1, 10), (4, 14)])
+def test_ticks_that_a_predecessor_drove_are_answered_and_not_learnt_from(
+    tmp_path: Path, ahead: int, first: int
+) -> None:
+    ticks = [tick(number, [7]) for number in range(10, 20)]
+    stream = iter([*ticks[:-1], replace(ticks[-1], last=True)])
+    channel = TakenOverChannel(run_file(str(tmp_path), 1, drives=True), stream, ahead=ahead, first_tick=10)
+    env = CarAwareVectorEnv(channel, reward=which)
+    observation, _ = env.reset()
+    assert when(observation) == [first]
+    env.step(np.full((1, 2), 0.5, np.float32))
+    # The world may still wait for the answer to the newest of them.
+    assert sorted(channel.actions) == list(range(10, first + 1))
+    assert all(not channel.actions[number].any() for number in range(10, first))
+    assert channel.actions[first].any()
+
+
 class Restartable:
     """A source of hand-made runs that can be started again."""
 
@@ -270,6 +299,10 @@ class Restartable:
         """The next tick."""
         self.current = next(self._ticks, None)
         return self.current
+
+    def is_passed(self) -> bool:
+        """No other policy has answered before."""
+        return False
 
     def restart(self, seed: int | None = None) -> None:
         """Start the run again."""

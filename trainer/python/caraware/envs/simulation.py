@@ -124,6 +124,10 @@ class Simulation:
         self._start(seed)
         self._first_seed = first
 
+    def is_passed(self) -> bool:
+        """Never: no other policy has answered before."""
+        return False
+
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run. Raises `SimulationError` if the simulation ends before."""
         self.current = None

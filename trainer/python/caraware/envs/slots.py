@@ -77,6 +77,9 @@ class Source(Protocol):
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
 
+    def is_passed(self) -> bool:
+        """The world has gone on with another policy's answer to the current tick: nothing can be learnt from it."""
+
     def restart(self, seed: int | None = None) -> None:
         """Begin another run, where that is possible; there is no current tick then until one is received."""
 
@@ -96,6 +99,11 @@ class GivenChannel:
         # Where a run is taken over, what comes before the first tick is the predecessor's.
         self._last, self._newest = False, getattr(channel, "first_tick", 0) - 1
         self.lost_ticks = self.duplicated_ticks = 0
+        self._passed_until = -1
+        # A world that waits for actions is one tick ahead of a learner at most, but for what a predecessor answered.
+        if channel.actor_lag_ticks() > 1:
+            self._passed_until = self._newest + channel.actor_lag_ticks()
+            log.info("ticks up to %d were driven by another policy, and are not learnt from", self._passed_until)
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
@@ -112,6 +120,10 @@ class GivenChannel:
         self.duplicated_ticks += self.current.tick <= self._newest
         self._last, self._newest = self.current.last, self.current.tick
         return self.current
+
+    def is_passed(self) -> bool:
+        """The world has gone on with what a predecessor answered to the current tick."""
+        return self.current is not None and self.current.tick <= self._passed_until
 
     def restart(self, seed: int | None = None) -> None:
         """Never called: the run is its supervisor's."""
@@ -317,12 +329,17 @@ class Slots:
         return None if obs is None else self._copied(obs)
 
     def _settle(self, tick: Tick | None) -> Tick:
-        """Runs on to the first tick that asks for a decision: not an evaluation's, with a vehicle in some slot."""
+        """Runs on to the first tick that asks for a decision.
+
+        It is not an evaluation's, has a vehicle in some slot, and no predecessor has answered it.
+        """
         while True:
             if tick is None:
                 if not self.source.can_restart:
                     return self._end_of_run()
                 self._restart()
+            elif self.source.is_passed():
+                self._answer(self._idle)
             elif tick.evaluation:
                 self._evaluate(tick)
             elif tick.mask.any():
