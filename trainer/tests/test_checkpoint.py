@@ -1,9 +1,11 @@
 """Checkpoints: a round trip, bit-exact resumption, and damage that is refused."""
 
+import gc
 import json
 import math
 import os
 import random
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -317,6 +319,28 @@ def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
     assert repr(found) == repr(course)
     assert load_checkpoint(written, fresh()) == Counters(1, 7, 0, 9)
     assert load_history(save(tmp_path / "bare", ppo)) == TrainingHistory()
+
+
+def test_checkpoints_of_a_growing_course_leave_nothing_in_memory(tmp_path: Path) -> None:
+    ppo, points = fresh(), TrainingPoints()
+
+    def save_next(number: int) -> None:
+        points.append(TrainingPoint(number, 0.3, 0.1, {"error_m": 5.0}, 1.0))
+        course = TrainingHistory(11, 1, 2, 6, 40, [], points)
+        save_checkpoint(tmp_path, ppo, Counters(number, 7, 0, 9), "0", Keeping(2), course)
+
+    for number in range(1, 11):
+        save_next(number)
+    gc.collect()
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for number in range(11, 61):
+        save_next(number)
+    gc.collect()
+    kept_bytes = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    # safetensors keeps some numbers of each.
+    assert kept_bytes < 50 * 1500
 
 
 def test_a_checkpoint_takes_the_place_of_one_with_its_name(tmp_path: Path) -> None:

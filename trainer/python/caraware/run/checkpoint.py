@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
+from safetensors.numpy import save as save_arrays
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -177,7 +178,8 @@ def _write_files(
     files = {name: _write(folder / name, save(_contiguous(named))) for name, named in merged.items()}
     if history is not None:
         points = TrainingPoints.of(history.training)
-        files[POINTS] = _write(folder / POINTS, save({"training": torch.from_numpy(points.rows())}))
+        # Not by safetensors.torch: for each size of a tensor that keeps two types of ctypes for ever, some 6 KB.
+        files[POINTS] = _write(folder / POINTS, save_arrays({"training": points.rows()}))
         evaluations = [result.report() for result in history.evaluations]
         rest = asdict(replace(history, training=(), evaluations=[]))
         rest |= {"training": list(points.names), "evaluations": evaluations}
