@@ -148,8 +148,8 @@ impl EndurancePlace {
     }
 }
 
-/// The boards of `sensor-daemon` in all environments, and of the trainer. They are opened while a run starts and kept until its end: a node that is opened
-/// while a run ends would leave files behind.
+/// The boards of `sensor-daemon` in all environments, and of the trainer. They are opened while a run starts and kept until its end: a
+/// node that is opened while a run ends would leave files behind.
 struct WatchedBoards {
     boards: Vec<BoardReader>,
     trainer: BoardReader,
