@@ -21,16 +21,9 @@ const SETTINGS: [&str; 8] = [
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",
 ];
-const TOWN: [&str; 6] = [
+/// The first is of the case with messages between vehicles.
+static TOWN: [&str; 6] = [
     "v2x.share=0.5",
-    "traffic.cavs=6",
-    "traffic.others=3",
-    "traffic.pedestrians=3",
-    "episode.ticks=300",
-    "episode.evaluation_ticks=50",
-];
-/// The same without messages between vehicles.
-const LEARNERS: [&str; 5] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
@@ -98,7 +91,7 @@ impl EnduranceCase {
             Self {
                 name: "learners",
                 input: "town".into(),
-                settings: &LEARNERS,
+                settings: &TOWN[1..],
                 envs: 1,
                 own: None,
                 learners_take_turns: true,
