@@ -230,6 +230,60 @@ fn what_a_client_reads_is_not_counted_as_written() {
     assert_eq!(counted(), Some(1));
 }
 
+/// Without passwords and certificates, a run is shown to its own user and to root alone, also on loopback.
+#[test]
+fn another_user_of_the_machine_sees_nothing() {
+    if !rustix::process::getuid().is_root() {
+        // Only root can act as another user.
+        return;
+    }
+    let mut run = Run::new("private", Mode::Simulate);
+    // Also with the right to command for every client.
+    run.file.config.fanout.commanders = vec![Commander::EveryClient];
+    run.file.write().unwrap();
+    let _fanout = start_listening(&run);
+    let own = until_connected(|| connect(&run, ""));
+    until_alive(&run, &own);
+
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let program = dir.path().join("fanout-watch");
+    std::fs::copy(env!("CARGO_BIN_EXE_fanout-watch"), &program).unwrap();
+    let endpoint = format!("tcp/127.0.0.1:{}", run.port);
+    let watch = |user: &str| {
+        let mut command = std::process::Command::new("setpriv");
+        command.args([&format!("--reuid={user}"), &format!("--regid={user}"), "--clear-groups"]);
+        command
+            .arg(&program)
+            .args([&endpoint, &run.file.name, "--seconds", "2"]);
+        command.current_dir("/").output().unwrap()
+    };
+    let refused = || {
+        let status = ask(&own, &run.key(Topic::Status)).unwrap_or_default();
+        let status: serde_json::Value = serde_json::from_slice(&status).unwrap_or_default();
+        status["fanout"]["refused_connections"].as_u64()
+    };
+    let received = |output: &std::process::Output| {
+        let line = output
+            .stdout
+            .trim_ascii_end()
+            .rsplit(|byte| *byte == b'\n')
+            .next()
+            .unwrap();
+        let counts: serde_json::Value = serde_json::from_slice(line).unwrap_or_default();
+        counts["status"]["received"].as_u64()
+    };
+    let seen = watch("0");
+    assert!(received(&seen).is_some_and(|count| count > 0), "{seen:?}");
+    until("a status", || refused() == Some(0));
+    let unseen = watch("65534");
+    assert!(!unseen.status.success() && unseen.stdout.is_empty(), "{unseen:?}");
+    until("a refused connection in the status", || {
+        refused().is_some_and(|count| count > 0)
+    });
+    assert!(ask(&own, &run.key(Topic::Map)).is_some());
+}
+
 /// By default no client may command, not even one on this machine.
 #[test]
 fn without_commanders_no_client_may_command() {

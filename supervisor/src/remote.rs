@@ -70,6 +70,14 @@ fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
              and connect viewers through a tunnel: ssh -N -L 7447:127.0.0.1:7447 HOST",
         ));
     }
+    // Of unencrypted connections `fanout` passes on those of its own user alone.
+    if is_encrypted && fanout.users.is_none() && fanout.tls_client_ca.is_none() {
+        return Err(Exit::config(
+            format!("`fanout.listen` = \"{listen}\" would admit every user of this machine"),
+            "list the users in fanout.users, or require certificates with fanout.tls_client_ca (docs/remote.md); or listen on \
+             tcp/127.0.0.1:7447, which admits you alone",
+        ));
+    }
     let refuse = |error: std::io::Error| {
         Exit::config(
             format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
@@ -254,6 +262,10 @@ mod tests {
         };
         says("needs a certificate", &|fanout| {
             fanout.listen = "tls/127.0.0.1:0".parse().unwrap();
+        });
+        says("would admit every user of this machine", &|fanout| {
+            fanout.listen = "tls/127.0.0.1:0".parse().unwrap();
+            (fanout.tls_certificate, fanout.tls_private_key) = (users.clone(), users.clone());
         });
         says("cannot be read", &|fanout| fanout.users = Some("/nowhere/users".into()));
         says("by other users", &|fanout| fanout.users = open.clone());

@@ -113,6 +113,13 @@ static UNLOGGED: Mutex<UnloggedRefusals> = Mutex::new(UnloggedRefusals {
 /// Refused connections that are logged.
 static LOGGED: AtomicU64 = AtomicU64::new(0);
 
+/// Counts a refused connection.
+pub fn count_refusal(reason: String) {
+    let mut refused = UNLOGGED.lock().unwrap_or_else(PoisonError::into_inner);
+    refused.count += 1;
+    refused.newest = reason;
+}
+
 /// Logs the connections refused since the last call; returns the number of all refused connections.
 pub fn log_refusals() -> u64 {
     let refused = std::mem::take(&mut *UNLOGGED.lock().unwrap_or_else(PoisonError::into_inner));
@@ -210,9 +217,7 @@ impl<S: Subscriber> Layer<S> for RefusalLayer {
             .any(|(module, begin)| *module == target && text.starts_with(begin))
             && !HARMLESS.iter().any(|harmless| text.contains(harmless));
         if is_refusal {
-            let mut refused = UNLOGGED.lock().unwrap_or_else(PoisonError::into_inner);
-            refused.count += 1;
-            refused.newest = plain_reason(&text);
+            count_refusal(plain_reason(&text));
         }
     }
 }

@@ -1,27 +1,91 @@
 //! The endpoint: the one place that makes zenoh's configuration. It is closed unless the run's configuration opens it.
 
-use std::{io, net::TcpListener};
+use std::{io, net::TcpListener, path::Path};
 
-use ipc_schema::config::{FanoutConfig, FanoutEndpoint};
+use ipc_schema::{
+    config::{EndpointProtocol, FanoutConfig, FanoutEndpoint},
+    run::RunFile,
+};
 use zenoh::{Wait, config::Config};
 
-use crate::{error::NetworkError, network::access};
+use crate::{
+    error::NetworkError,
+    network::{
+        access,
+        loopback::LoopbackGate,
+        publisher::{self, EnvironmentPublisher},
+    },
+};
 
-/// Opens a zenoh session that listens on `fanout.listen`, and nowhere else.
-///
-/// # Errors
-/// The endpoint is malformed, in use, or not of this machine, or a certificate or the file of users cannot be used.
-pub fn listen(settings: &FanoutConfig) -> Result<zenoh::Session, NetworkError> {
-    let endpoint = &settings.listen;
-    let failed = |error: zenoh::Error| NetworkError::Listen {
-        endpoint: endpoint.to_string(),
-        reason: system_reason(endpoint).unwrap_or_else(|| error.to_string()),
-    };
-    let mut config = config(settings).map_err(failed)?;
-    for (key, value) in access::settings(settings) {
-        config.insert_json5(key, &value).map_err(failed)?;
+/// The socket file on which zenoh listens behind a [`LoopbackGate`], in a directory that only its user can enter.
+const SOCKET: &str = "viewers";
+
+/// The zenoh session of a run, and what stands before it.
+#[derive(Debug)]
+pub struct Endpoint {
+    /// The session that publishes, and answers queries.
+    pub session: zenoh::Session,
+    /// Of an endpoint without passwords and certificates.
+    gate: Option<LoopbackGate>,
+}
+
+impl Endpoint {
+    /// Listens on `fanout.listen`, and nowhere else.
+    ///
+    /// # Errors
+    /// The endpoint is malformed, in use, or not of this machine, or a certificate or the file of users cannot be used.
+    pub fn open(run: &RunFile) -> Result<Self, NetworkError> {
+        let settings = &run.config.fanout;
+        if !authenticates(settings) {
+            return Self::open_behind_gate(settings, &run.shared_memory.root.join(SOCKET));
+        }
+        let endpoint = &settings.listen;
+        let session = listen(settings, &endpoint.to_string())
+            .map_err(|error| refused(endpoint, system_reason(endpoint).unwrap_or_else(|| error.to_string())))?;
+        Ok(Self { session, gate: None })
     }
-    open(config).map_err(failed)
+
+    fn open_behind_gate(settings: &FanoutConfig, socket: &Path) -> Result<Self, NetworkError> {
+        let endpoint = &settings.listen;
+        let failed = |error: io::Error| refused(endpoint, reason(&error, endpoint));
+        let listener = TcpListener::bind(endpoint.address()).map_err(failed)?;
+        let session = listen(settings, &format!("unixsock-stream/{}", socket.display()))
+            .map_err(|error| refused(endpoint, error.to_string()))?;
+        let gate = LoopbackGate::open(listener, socket).map_err(failed)?;
+        Ok(Self {
+            session,
+            gate: Some(gate),
+        })
+    }
+
+    /// Closes the session after what is queued for viewers has been sent.
+    pub fn close(self, publishers: Vec<EnvironmentPublisher>) {
+        publisher::close(publishers, &self.session);
+        if let Some(gate) = self.gate {
+            gate.close(publisher::CLOSE_DELAY);
+        }
+    }
+}
+
+/// True if zenoh itself listens on `fanout.listen`: it asks who a client is, or encrypts, which the supervisor does not allow without.
+fn authenticates(settings: &FanoutConfig) -> bool {
+    settings.users.is_some() || settings.tls_client_ca.is_some() || settings.listen.protocol == EndpointProtocol::Tls
+}
+
+fn refused(endpoint: &FanoutEndpoint, reason: String) -> NetworkError {
+    NetworkError::Listen {
+        endpoint: endpoint.to_string(),
+        reason,
+    }
+}
+
+/// Opens a zenoh session that listens on `locator`.
+fn listen(settings: &FanoutConfig, locator: &str) -> zenoh::Result<zenoh::Session> {
+    let mut config = config(locator)?;
+    for (key, value) in access::settings(settings) {
+        config.insert_json5(key, &value)?;
+    }
+    open(config)
 }
 
 /// Opens a zenoh session, of a client as well. Each crate that calls `zenoh::open` compiles most of zenoh's session again.
@@ -34,8 +98,8 @@ pub fn open(config: Config) -> zenoh::Result<zenoh::Session> {
 
 /// zenoh's configuration: one endpoint, no discovery, no shared memory, no administration space. With these waits, queues and buffer a
 /// stalled or slow viewer delays `put` by at most 0.6 ms (measured).
-fn config(settings: &FanoutConfig) -> zenoh::Result<Config> {
-    let endpoint = serde_json::to_string(&settings.listen)?;
+fn config(locator: &str) -> zenoh::Result<Config> {
+    let endpoint = serde_json::to_string(locator)?;
     Config::from_json5(&format!(
         r#"{{
             mode: "router",
@@ -86,7 +150,8 @@ mod tests {
             listen: endpoint.parse().unwrap(),
             ..config.fanout
         };
-        match listen(&settings) {
+        let dir = tempfile::tempdir().unwrap();
+        match Endpoint::open_behind_gate(&settings, &dir.path().join(SOCKET)) {
             Ok(_) => panic!("{endpoint} was accepted"),
             Err(error) => error.into(),
         }

@@ -4,4 +4,5 @@ pub mod access;
 pub mod commands;
 pub mod endpoint;
 pub mod keys;
+pub mod loopback;
 pub mod publisher;

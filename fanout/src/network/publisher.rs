@@ -28,7 +28,7 @@ use crate::{
 };
 
 /// Time for the last frames to leave zenoh's queues: at most 1 MB for each viewer.
-const CLOSE_DELAY: Duration = Duration::from_millis(500);
+pub(crate) const CLOSE_DELAY: Duration = Duration::from_millis(500);
 /// Most queries that wait for an answer; more are not answered. A viewer that stalls while it is answered delays the other answers by at
 /// most zenoh's 5 s, and delays no frame.
 const MAX_QUERIES: usize = 256;

@@ -16,13 +16,13 @@ use ipc_schema::{membership::RunMembership, services::Channel};
 
 use crate::{
     error::FanoutError,
-    network::{endpoint, publisher},
+    network::endpoint::Endpoint,
     relay::{environment::EnvironmentRelay, pace::PollInterval},
 };
 
 /// The fan-out of a run: a relay for each environment, all behind one endpoint.
 pub struct RunRelay {
-    zenoh: zenoh::Session,
+    endpoint: Endpoint,
     /// By the number of the environment.
     environments: Vec<EnvironmentRelay>,
     poll_interval: PollInterval,
@@ -34,7 +34,7 @@ impl RunRelay {
     /// # Errors
     /// A service of the run is missing, or the endpoint cannot be listened on.
     pub fn open(membership: RunMembership) -> Result<Self, FanoutError> {
-        let zenoh = endpoint::listen(&membership.run.config.fanout)?;
+        let endpoint = Endpoint::open(&membership.run)?;
         let poll_interval = PollInterval::new(Channel::World.queue_length(&membership.run));
         let first_run = membership.run.clone();
         let others: Vec<RunMembership> = (1..membership.run.config.run.envs)
@@ -43,10 +43,10 @@ impl RunRelay {
         let environments = std::iter::once(membership)
             .chain(others)
             .zip(0..)
-            .map(|(membership, env_index)| EnvironmentRelay::open(membership, env_index, &zenoh, &first_run))
+            .map(|(membership, env_index)| EnvironmentRelay::open(membership, env_index, &endpoint.session, &first_run))
             .collect::<Result<_, _>>()?;
         Ok(Self {
-            zenoh,
+            endpoint,
             environments,
             poll_interval,
         })
@@ -88,7 +88,7 @@ impl RunRelay {
             .into_iter()
             .map(EnvironmentRelay::into_publisher)
             .collect();
-        publisher::close(publishers, &self.zenoh);
+        self.endpoint.close(publishers);
         Ok(())
     }
 }

@@ -45,12 +45,7 @@ fn another_user_can_neither_attach_to_a_run_nor_command_it() {
     }
     let program = workplace.path().join("caraware");
     std::fs::copy(env!("CARGO_BIN_EXE_caraware"), &program).unwrap();
-    let endless = [
-        "--set",
-        "episode.training_episodes=100000",
-        "--set",
-        "fanout.enabled=false",
-    ];
+    let endless = ["--set", "episode.training_episodes=100000"];
     let command = workplace.command(&[&["simulate", "town", "--name", "mine"], &endless[..]].concat());
     let mut shell = Command::new("sh");
     shell.args(["-c", "umask 000 && exec \"$@\"", "sh"]);
