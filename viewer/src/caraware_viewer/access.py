@@ -143,7 +143,10 @@ def _is_listening(endpoint: str) -> bool:
 
 def _refusal_message(endpoint: str, credentials: Credentials, reason: str) -> str:
     if credentials.user is None and credentials.certificate is None:
-        hint = "it requires credentials: give --user and --password-file, or --certificate and --key"
+        hint = (
+            "it requires credentials: give --user and --password-file, or --certificate and --key.\n"
+            "  A run without passwords admits the user alone who started it"
+        )
     elif credentials.user is None:
         hint = "it does not accept this certificate, or it requires --user and --password-file as well"
     else:
