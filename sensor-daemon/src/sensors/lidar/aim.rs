@@ -8,7 +8,7 @@ use super::{
     sensor::{Rotation, turned},
     simd::{Floats, Simd, WIDTH},
     solids::NOTHING,
-    terrain::{GroundProfile, Terrain, TerrainView},
+    terrain::{GroundProfile, Terrain, TerrainView, between},
 };
 
 /// How far the ground is drawn before all surfaces, metres: the lower lasers end there, and far surfaces are only looked at for rays
@@ -55,9 +55,14 @@ impl SpanScan<'_> {
         if UPRIGHT {
             return self.ground_upright::<S>(canvas);
         }
+        let is_flat = self.order.lidar.ground_m.is_some();
         for column in 0..self.span.count {
             self.aim::<S>(canvas, column);
-            self.ground_tilted::<S>(canvas, column);
+            if is_flat {
+                self.ground_tilted::<S>(canvas, column);
+            } else {
+                canvas.clear::<S>(column, S::splat(self.order.lidar.range_m as f32));
+            }
         }
     }
 
@@ -106,7 +111,7 @@ impl SpanScan<'_> {
             if !profile.is_new(chunk) {
                 continue;
             }
-            let share = canvas.columns[chunk].share.0[element];
+            let ends = terrain.ends::<S>(view, canvas.columns[chunk].share.0[element]);
             let mut next = profile.first(chunk);
             for (group, rays) in self.order.lidar.pattern.groups.iter().enumerate() {
                 let place = column * canvas.groups + group;
@@ -118,7 +123,7 @@ impl SpanScan<'_> {
                 let t = met.height / facing;
                 let best = S::load(&canvas.t[place]);
                 let seen = S::both(S::lt(facing, zero), S::both(S::lt(zero, t), S::lt(t, best)));
-                let is_hit = S::both(seen, terrain.holds::<S>(view, share, [t * x, t * y]));
+                let is_hit = S::both(seen, between::<S>(&ends, [t * x, t * y]));
                 let length = S::sqrt(S::splat(1.0) + met.slope[0] * met.slope[0] + met.slope[1] * met.slope[1]);
                 canvas.put::<S>(place, is_hit, (t, best), facing / length, &GROUND_BODY);
             }

@@ -8,7 +8,10 @@
 //! `t` is that distance. Any other sensor has a direction for each ray, and `t` is the range. A corner is tested by the same expression
 //! for both walls that share it, so that no ray slips through between them.
 
-use super::simd::{Floats, Simd, WIDTH, Words};
+use super::{
+    simd::{Floats, Simd, WIDTH, Words},
+    solids::NOTHING,
+};
 
 /// Sixteen columns, four times.
 pub(super) const CHUNKS: usize = super::firing::SPAN / WIDTH;
@@ -211,6 +214,15 @@ impl ScanCanvas {
     pub(super) fn live(&self, chunk: usize) -> u32 {
         let count = self.count.saturating_sub(chunk * WIDTH).min(WIDTH);
         ((1_u64 << count) - 1) as u32
+    }
+
+    /// Sets the rays of a column to no hit within `range`. What else there is of a ray is read of hits alone.
+    #[inline(always)]
+    pub(super) fn clear<S: Simd>(&mut self, column: usize, range: S::F) {
+        for place in column * self.groups..(column + 1) * self.groups {
+            S::store(range, &mut self.t[place]);
+            S::store_words(S::splat_words(NOTHING), &mut self.word[place]);
+        }
     }
 
     /// Sets the rays of `mask` in a place, which reached `best` so far, to a hit on `body`, and returns how far they reach. The distance

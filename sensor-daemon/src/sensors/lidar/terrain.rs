@@ -274,13 +274,14 @@ impl Terrain {
             Walk::new(self, view, third),
             Walk::new(self, view, fourth),
         ];
+        let live = [canvas.live(0), canvas.live(1), canvas.live(2), canvas.live(3)];
         // Chunk by chunk within a step: the corners of a chunk depend on each other, those of different chunks do not.
         while walking != 0 {
             for chunk in set(walking) {
                 let segment = &mut profile.segments[profile.to[chunk]][chunk];
                 let ahead = walks[chunk].step(&mut profile.edges[chunk], segment);
                 profile.to[chunk] += 1;
-                let is_short = S::bits(S::lt(ahead, S::splat(reach[chunk]))) & canvas.live(chunk) != 0;
+                let is_short = S::bits(S::lt(ahead, S::splat(reach[chunk]))) & live[chunk] != 0;
                 if !is_short || profile.to[chunk] == most {
                     walking &= !(1 << chunk);
                 }
@@ -288,22 +289,32 @@ impl Terrain {
         }
     }
 
-    /// Whether the places of hits are within the lattice.
+    /// The lattice's ends along x and y, relative to the sensor at a share of the span. No closure: see `raster::at2`.
     #[inline(always)]
-    pub(super) fn holds<S: Simd>(&self, view: &TerrainView, share: f32, place: [S::F; 2]) -> S::M {
-        let [x, y] = [0, 1].map(|axis: usize| {
-            let origin = view.origin[axis].0 + share * view.origin[axis].1;
-            let low = origin - view.centre[axis] as f32 * self.grid.cell_m as f32;
-            [
-                low,
-                low + (self.grid.corners[axis] - 1) as f32 * self.grid.cell_m as f32,
-            ]
-        });
-        S::both(
-            S::both(S::le(S::splat(x[0]), place[0]), S::le(place[0], S::splat(x[1]))),
-            S::both(S::le(S::splat(y[0]), place[1]), S::le(place[1], S::splat(y[1]))),
-        )
+    pub(super) fn ends<S: Simd>(&self, view: &TerrainView, share: f32) -> [[S::F; 2]; 2] {
+        [
+            self.ends_along::<S>(0, view, share),
+            self.ends_along::<S>(1, view, share),
+        ]
     }
+
+    #[inline(always)]
+    fn ends_along<S: Simd>(&self, axis: usize, view: &TerrainView, share: f32) -> [S::F; 2] {
+        let origin = view.origin[axis].0 + share * view.origin[axis].1;
+        let low = origin - view.centre[axis] as f32 * self.grid.cell_m as f32;
+        let high = low + (self.grid.corners[axis] - 1) as f32 * self.grid.cell_m as f32;
+        [S::splat(low), S::splat(high)]
+    }
+}
+
+/// Whether places are between these ends.
+#[inline(always)]
+pub(super) fn between<S: Simd>(ends: &[[S::F; 2]; 2], place: [S::F; 2]) -> S::M {
+    let [[left, right], [low, high]] = *ends;
+    S::both(
+        S::both(S::le(left, place[0]), S::le(place[0], right)),
+        S::both(S::le(low, place[1]), S::le(place[1], high)),
+    )
 }
 
 impl<S: Simd> Corner<S> {
@@ -357,7 +368,7 @@ struct Walk<'a, S: Simd> {
     /// First and last column and row, from the centre.
     least: [S::F; 2],
     most: [S::F; 2],
-    /// Corners in a row, and number of the centre among all corners.
+    /// Corners in a row, and number of the centre among all corners, plus 2²³.
     stride: S::F,
     first: S::F,
 }
@@ -392,7 +403,7 @@ impl<'a, S: Simd> Walk<'a, S> {
                 S::splat((rows as i32 - 1 - y) as f32),
             ],
             stride: S::splat(columns as f32),
-            first: S::splat((y * columns as i32 + x) as f32),
+            first: S::splat((y * columns as i32 + x) as f32 + 8_388_608.0),
         }
     }
 
@@ -407,9 +418,9 @@ impl<'a, S: Simd> Walk<'a, S> {
             S::min(S::max(at[0], self.least[0]), self.most[0]),
             S::min(S::max(at[1], self.least[1]), self.most[1]),
         ];
-        // Numbers below 2²³ are exact in f32, and are the lowest bits of their sum with 2²³.
+        // Numbers below 2²³ are exact in f32, and are the lowest bits of their sum with 2²³, which is in `first`.
         let number = row * self.stride + column + self.first;
-        let number = S::and(S::words(number + S::splat(8_388_608.0)), S::splat_words(0x007F_FFFF));
+        let number = S::and(S::words(number), S::splat_words(0x007F_FFFF));
         let z = self.origin[2] + S::gather(self.heights, number);
         self.seen(at, z)
     }
