@@ -73,6 +73,10 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             HANDOVER_INTERVAL,
         ),
     };
+    // Of this process and all that it starts. With huge pages Linux turns one page of 4 KiB that a process has touched into 2 MiB, at a
+    // moment of its own.
+    rustix::thread::disable_transparent_huge_pages(true)
+        .map_err(|error| Exit::run(format!("cannot do without huge pages: {error}"), ""))?;
     let directory = BenchDirectory::new(NAME)?;
     let mut run = SoakRun::start(options, directory.path())?;
     run.wait_for_update()?;
@@ -100,7 +104,8 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         format!(
             "The town with messages between vehicles, at full speed without end, {VIEWERS} viewers that count frames, {handovers} handovers \
              after an update or at once in turn ({refused} more were refused), watched for {:.1} h. The memory is that \
-             which belongs to a process alone (RssAnon). Growth is the median of the slopes between all pairs of samples of one process, \
+             which belongs to a process alone (RssAnon), without huge pages, of which Linux makes one wherever a process has touched a page of \
+             a region that asks for them. Growth is the median of the slopes between all pairs of samples of one process, \
              those of the first {:.0} % of its life left out; first and last are medians of a tenth of the samples.",
             time.as_secs_f64() / 3600.0,
             100.0 * FILLING
