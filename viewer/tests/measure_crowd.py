@@ -96,6 +96,7 @@ def publish(port: int, vehicles: int, stop: float) -> None:
         "mode": "peer",
         "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
         "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
     }.items():
         config.insert_json5(key, json.dumps(value))
     session = zenoh.open(config)

@@ -33,6 +33,7 @@ def guarded(tmp_path: Path) -> Iterator[str]:
         "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
         "transport/auth/usrpwd/dictionary_file": str(users),
     }.items():
         config.insert_json5(key, json.dumps(value))
@@ -64,6 +65,7 @@ def test_a_viewer_waits_for_a_run_that_starts_to_listen() -> None:
         config.insert_json5("mode", '"router"')
         config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
         config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("transport/shared_memory/enabled", "false")
         opened.append(zenoh.open(config))
 
     late = threading.Timer(0.7, listen)

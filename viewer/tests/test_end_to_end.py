@@ -42,6 +42,7 @@ class StandIn:
             "listen/endpoints": [f"tcp/127.0.0.1:{port}"],
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
+            "transport/shared_memory/enabled": False,
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
