@@ -13,6 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
+import pytest
+from caraware.examples import sb3_takeover
+from full_disk import FullDisk
+from stable_baselines3 import PPO
 
 CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
 MODULE = "caraware.examples.sb3_takeover"
@@ -117,3 +121,13 @@ def test_a_takeover_before_the_first_checkpoint_survives_a_kill_and_resumes() ->
         report = json.loads((directory / "report.json").read_text())
         assert report["result"] == "completed"
         assert (report["lost_ticks"], report["duplicated_ticks"]) == (0, 0)
+
+
+def test_the_model_waits_for_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its commit comes after it: an error would lose the learner, and the next one would learn these ticks again."""
+    disk = FullDisk(monkeypatch, times=2)
+    model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu")
+    file = sb3_takeover.save(model, tmp_path / "models", 7)
+    assert disk.refused[".partial"] == 2
+    assert PPO.load(file, device="cpu").n_steps == 8
+    assert list(file.parent.iterdir()) == [file]

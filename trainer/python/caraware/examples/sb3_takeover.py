@@ -23,6 +23,7 @@ from caraware.examples.sb3_ppo import ppo
 from caraware.ipc.channel import Channel
 from caraware.ipc.commits import CommitLog
 from caraware.ipc.run_file import RunFile
+from caraware.ipc.storage import when_there_is_space
 from caraware.run.continuation import own_checkpoints
 from caraware.run.manifest import read_manifest
 from caraware.run.process import HandoverRole, SuccessorClaims
@@ -51,15 +52,18 @@ class SaveAndCommit(BaseCallback):
 
 
 def save(model: BaseAlgorithm, folder: Path, tick: int) -> Path:
-    """Put the model on disk under the name of its newest tick, complete or not at all."""
-    folder.mkdir(exist_ok=True)
+    """Put the model on disk under the name of its newest tick, complete or not at all. A full disk is waited for."""
     file, partial = model_file(folder, tick), folder / ".partial"
-    with partial.open("wb") as stream:
-        model.save(stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    partial.rename(file)
-    return file
+
+    def write() -> Path:
+        folder.mkdir(exist_ok=True)
+        with partial.open("wb") as stream:
+            model.save(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        return partial.rename(file)
+
+    return when_there_is_space(file, write)
 
 
 def model_file(folder: Path, tick: int) -> Path:
