@@ -121,6 +121,8 @@ struct Run {
 impl Run {
     fn start(machines: &Machines, workplace: &Workplace, name: &str, mode: &str, settings: &[String]) -> Self {
         let mut arguments = vec![mode, "town", "--name", name, "--set", "run.real_time_factor=4"];
+        // An episode that outlasts the test: its number shows whether a reader has reset it.
+        arguments.extend(["--set", "episode.ticks=100000"]);
         arguments.extend(settings.iter().flat_map(|setting| ["--set", setting.as_str()]));
         let child = machines
             .on_the_lab(workplace, &arguments)
