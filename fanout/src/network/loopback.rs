@@ -23,11 +23,11 @@ use tokio::{
 
 use crate::network::access;
 
-/// What Linux keeps for a viewer that reads slowly, bytes. All of it is older than what comes next.
+/// Bytes that Linux keeps for a viewer that reads slowly.
 const SEND_BUFFER_BYTES: usize = 65536;
 /// Bytes that are copied at once, towards zenoh and towards the viewer.
 const COPIED_BYTES: (usize, usize) = (4096, 65536);
-/// Threads that look up whose a connection is.
+/// Threads that look up which user has opened a connection.
 const LOOKUP_THREADS: usize = 2;
 /// Pause after Linux has refused a connection, which it does while there are no file handles.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -109,7 +109,7 @@ async fn relay(mut viewer: TcpStream, peer: SocketAddr, socket: PathBuf) {
         )),
         // Its other end is closed already.
         Ok(None) => return,
-        Err(error) => Some(format!("whose it is cannot be told: {error}")),
+        Err(error) => Some(format!("its user cannot be looked up: {error}")),
     };
     if let Some(reason) = refusal {
         return access::count_refusal(reason);

@@ -511,7 +511,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("fusion.segment_ticks", "ticks", 1, 1_000_000, "The estimator learns from an episode in pieces of this many ticks, side by side."),
     integer("fusion.truncation_ticks", "ticks", 1, 1_000_000, "Ticks between two gradient steps, over which a gradient propagates back; divides `fusion.segment_ticks`."),
     other("fanout.enabled", ValueKind::Flag, "Start the fan-out process, which lets viewers attach."),
-    other("fanout.listen", ValueKind::TextOf(TextForm::Endpoint), "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. On tcp and loopback it admits your own user alone, without configuration. Beyond, and on tls, it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
+    other("fanout.listen", ValueKind::TextOf(TextForm::Endpoint), "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. On tcp and loopback it admits your own user and root. Beyond, and on tls, it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
     other("fanout.users", ValueKind::Text, "File of the users that may connect, one line user:password each, readable by its owner alone; \"\" = on loopback your own user and root, without a password."),
     other("fanout.tls_certificate", ValueKind::Text, "Certificate of this machine (PEM file), for an endpoint tls/…"),
     other("fanout.tls_private_key", ValueKind::Text, "Its private key (PEM file)."),

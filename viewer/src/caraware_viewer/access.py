@@ -145,7 +145,7 @@ def _refusal_message(endpoint: str, credentials: Credentials, reason: str) -> st
     if credentials.user is None and credentials.certificate is None:
         hint = (
             "it requires credentials: give --user and --password-file, or --certificate and --key.\n"
-            "  A run without passwords admits the user alone who started it"
+            "  A run without passwords admits only the user who started it"
         )
     elif credentials.user is None:
         hint = "it does not accept this certificate, or it requires --user and --password-file as well"
