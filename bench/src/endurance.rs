@@ -21,6 +21,9 @@ use self::{
 };
 use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, sides::BenchDirectory};
 
+/// A quick measurement gives up what it could not do in so many runs of a case.
+const MOST_QUICK_ROUNDS: u32 = 4;
+
 /// Disturbs runs for as long as `options` say, at least one of each case.
 ///
 /// # Errors
@@ -66,6 +69,10 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let begun = Instant::now();
     for round in 0.. {
         for ((case, counts), whole) in cases.iter().zip(&mut counts).zip(&undisturbed) {
+            // A short run may end before a process was there for each disturbance: the next round does what is left.
+            if options.quick && round > 0 && !counts.has_missed() {
+                continue;
+            }
             let name = format!("{}-{round}", case.name);
             let run = DisturbedRun::start(&place, case, &name, random.fork(), counts)?;
             if let Some(report) = run.disturb()? {
@@ -77,7 +84,11 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             // What was compared is not needed any more; hours of runs would fill the disk.
             remove(&place.run(&name))?;
         }
-        if options.quick || begun.elapsed() >= time {
+        let is_done = match options.quick {
+            true => round + 1 == MOST_QUICK_ROUNDS || !counts.iter().any(EnduranceCounts::has_missed),
+            false => begun.elapsed() >= time,
+        };
+        if is_done {
             break;
         }
         let [runs, faults] = [

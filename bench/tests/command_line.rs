@@ -101,7 +101,8 @@ fn disturbed_runs_end_as_if_nothing_had_happened() {
     let report: serde_json::Value = serde_json::from_reader(file).unwrap();
     let figures = report["figures"].as_object().unwrap();
     for (case, own) in [("town", Some("v2x")), ("grid", Some("recorder")), ("learners", None)] {
-        assert_eq!(figures[&format!("{case}: runs completed")], 1.0, "{text}");
+        let runs = figures[&format!("{case}: runs completed")].as_f64().unwrap();
+        assert!(runs >= 1.0, "{text}");
         let hung = figures
             .keys()
             .filter(|what| what.starts_with(&format!("{case}: ")) && what.ends_with(" hung"));

@@ -77,9 +77,11 @@ enum Disturbance {
     FullDisk,
 }
 
-/// What was done to the runs of a case, and what was measured.
+/// What was done to the runs of a case, what was measured, and what is still to be done.
 #[derive(Debug, Default)]
 pub struct EnduranceCounts {
+    /// What the last run that completed ended before, in reverse order.
+    missed: Vec<Disturbance>,
     /// Disturbances by name.
     pub disturbances: BTreeMap<String, u32>,
     /// Handovers that were refused or given up, by the first line of the reason.
@@ -97,6 +99,12 @@ pub struct EnduranceCounts {
 }
 
 impl EnduranceCounts {
+    /// True if the last run completed before everything had been done to it.
+    #[must_use]
+    pub const fn has_missed(&self) -> bool {
+        !self.missed.is_empty()
+    }
+
     fn count(&mut self, name: impl Into<String>) {
         *self.disturbances.entry(name.into()).or_default() += 1;
     }
@@ -202,7 +210,8 @@ impl Drop for DisturbedRun<'_> {
 }
 
 impl<'a> DisturbedRun<'a> {
-    /// Starts a run of `case`. The random numbers decide what is done to it and when.
+    /// Starts a run of `case`. The random numbers decide what is done to it and when. In a quick measurement it is what the run before
+    /// missed, if that was something.
     ///
     /// # Errors
     /// The program cannot be started.
@@ -214,7 +223,10 @@ impl<'a> DisturbedRun<'a> {
         counts: &'a mut EnduranceCounts,
     ) -> Result<Self, Exit> {
         let port = free_port()?;
-        let cards = draw_cards(place, case, &mut random);
+        let cards = match place.is_quick && counts.has_missed() {
+            true => std::mem::take(&mut counts.missed),
+            false => draw_cards(place, case, &mut random),
+        };
         Ok(Self {
             child: start(place, name, &case.arguments(name, PACE, Some(port)))?,
             place,
@@ -428,14 +440,16 @@ impl<'a> DisturbedRun<'a> {
 
     /// Stops a process that the supervisor starts, and waits until it has been killed and so can be replaced.
     fn hang_process(&mut self) -> Result<bool, Exit> {
-        let target = Target::ALL[self.random.usize(0..Target::ALL.len())];
         // A process that does not get ready when a run starts or resumes ends the run, so that no hang is found while a trainer starts.
         let has_begun = |watched: &WatchedBoards| watched.trainer.progress().consumed_ticks > 0;
-        if target == Target::Supervisor || !self.watched.as_ref().is_some_and(has_begun) {
+        if !self.watched.as_ref().is_some_and(has_begun) {
             return Ok(false);
         }
-        let hanging = self.random.choice(target.processes(&self.directory()));
-        let Some(hanging) = hanging.filter(|hanging| signal(*hanging, Signal::STOP)) else {
+        let directory = self.directory();
+        let pids = |target: Target| target.processes(&directory).into_iter().map(move |pid| (target, pid));
+        let processes = Target::ALL.into_iter().filter(|target| *target != Target::Supervisor);
+        let hanging = self.random.choice(processes.flat_map(pids).collect::<Vec<_>>());
+        let Some((target, hanging)) = hanging.filter(|(_, pid)| signal(*pid, Signal::STOP)) else {
             return Ok(false);
         };
         self.counts.count(format!("{} hung", target.name()));
@@ -574,6 +588,7 @@ impl<'a> DisturbedRun<'a> {
     /// Checks what a completed run leaves behind, and reads its report.
     fn finish(mut self) -> Result<Option<Value>, Exit> {
         self.counts.runs += 1;
+        self.counts.missed = std::mem::take(&mut self.cards);
         self.watched = None;
         for client in std::mem::take(&mut self.handovers) {
             self.count_handover(client)?;
