@@ -121,3 +121,32 @@ fn a_crate_has_the_heavy_dependencies_of_its_cell_and_no_other() {
         );
     }
 }
+
+/// Every third-party crate with its features that the dependencies of these kinds ask for.
+fn features(kinds: &str) -> BTreeSet<String> {
+    let output = Command::new(env!("CARGO"))
+        .args(["tree", "--workspace", "--locked", "--offline", "--prefix=none"])
+        .args(["--no-dedupe", "--format={p} [{f}]", "--edges", kinds])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout)
+        .unwrap()
+        .lines()
+        .map(ToOwned::to_owned)
+        .collect()
+}
+
+/// `make train` compiles the programs, `make test` the programs and their tests.
+#[test]
+fn tests_do_not_compile_a_third_party_crate_a_second_time() {
+    let [programs, tests] = ["normal,build", "normal,build,dev"].map(features);
+    assert!(tests.iter().any(|line| line.starts_with("proptest ")), "{tests:?}");
+    let again: Vec<_> = programs.difference(&tests).collect();
+    assert!(
+        again.is_empty(),
+        "the tests ask for other features of these crates, so that they and all that use them are compiled again: {again:?}; name \
+         the features in a crate's dependencies, as fanout/Cargo.toml does"
+    );
+}
