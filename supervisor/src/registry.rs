@@ -119,13 +119,24 @@ pub fn base() -> PathBuf {
     std::env::var_os(RUNTIME_DIR).map_or_else(|| format!("/tmp/caraware-{}", user_id()).into(), PathBuf::from)
 }
 
+/// Why runs cannot lie in this directory. zenoh listens on a socket below it, and takes `?` and `#` for the end of its path.
+fn fault_of_base(base: &Path) -> Option<&'static str> {
+    match base.to_str() {
+        _ if base.as_os_str().len() > BASE_BYTES => Some("is too long"),
+        _ if !base.is_absolute() => Some("is not absolute"),
+        None => Some("is not UTF-8"),
+        Some(text) if text.contains(['?', '#']) => Some("contains `?` or `#`"),
+        Some(_) => None,
+    }
+}
+
 /// Creates [`base`] for this user alone.
 fn create_base() -> Result<PathBuf, Exit> {
     let base = base();
     let help = format!("set {RUNTIME_DIR} to a short path of your own, up to {BASE_BYTES} bytes");
-    if base.as_os_str().len() > BASE_BYTES || !base.is_absolute() {
+    if let Some(fault) = fault_of_base(&base) {
         return Err(Exit::config(
-            format!("{RUNTIME_DIR} = {} is too long or not absolute", base.display()),
+            format!("{RUNTIME_DIR} = {} {fault}", base.display()),
             help,
         ));
     }
@@ -527,6 +538,17 @@ mod tests {
         assert!(refusal(Some("third"), here.path()).contains("no run named `third`"));
         assert!(refusal(Some("town-1"), Path::new("/")).contains("several runs named `town-1`"));
         assert!(refusal(None, here.path()).contains("several runs are alive"));
+    }
+
+    #[test]
+    fn a_base_is_a_short_absolute_path_that_an_address_of_zenoh_can_name() {
+        let fault = |path: &str| fault_of_base(Path::new(path));
+        assert_eq!(fault("/tmp/mine & yours, 2%"), None);
+        assert_eq!(fault(&format!("/{}", "a".repeat(BASE_BYTES))), Some("is too long"));
+        assert_eq!(fault("mine"), Some("is not absolute"));
+        for path in ["/tmp/mine?", "/tmp/#1"] {
+            assert_eq!(fault(path), Some("contains `?` or `#`"));
+        }
     }
 
     /// Makes a directory called `name` as a dead run leaves it; `change` alters the marker.
