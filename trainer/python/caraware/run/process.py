@@ -5,6 +5,7 @@ Exit codes: 0 done, or stopped by SIGTERM or SIGINT after a checkpoint; 1 the ru
 failure is reported once, in `<run>/logs/trainer.error.json`.
 """
 
+import gc
 import json
 import logging
 import os
@@ -134,6 +135,7 @@ def run_process(arguments: list[str], work: TrainerWork) -> int:
     run_file = Path(arguments[0])
     stop, role = StopSignal(), HandoverRole.from_environment()
     try:
+        _import_torch()
         work(run_file, stop, role)
     except Exception as error:  # the edge of the process: every failure is reported in one place
         failure = _explain(error)
@@ -141,6 +143,20 @@ def run_process(arguments: list[str], work: TrainerWork) -> int:
         failure.write(_run_dir(run_file), "successor" if role.gets_ready else "trainer")
         return EXIT_CODES[failure.kind]
     return 0
+
+
+def _import_torch() -> None:
+    """Import what takes longest in a third less time: without the garbage collector, which finds none meanwhile.
+
+    What is there afterwards is never garbage. Frozen, it is left out by later collections and by that at the exit.
+    """
+    gc.disable()
+    try:
+        import torch
+    finally:
+        gc.freeze()
+        gc.enable()
+    del torch
 
 
 def read_run(run_file: Path) -> RunFile:
