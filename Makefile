@@ -15,18 +15,18 @@ GPU ?= $(if $(wildcard /dev/nvidiactl /dev/dxg /proc/driver/nvidia/version),1,0)
 PREFIX ?=
 EXTRAS ?= envs,data,metrics,study
 
-.PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
+.PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-trainer test-packages \
 	timed-packages timed-programs with-cuda newcomer model miri deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
-# Rust's and Python's tests run side by side: both start whole runs, which wait a lot.
+# Rust's tests, the trainer's and those of the other Python packages run side by side: all start whole runs, which wait a lot.
 test: prerequisites browser $(VENV)/.sumo ## all tests
 	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/.installed programs-and-tests
 	$(EXTENSION)
 	$(COMMAND)
-	$(MAKE) --jobs=2 --output-sync=line test-rust test-python
+	$(MAKE) --jobs=3 --output-sync=line test-rust test-trainer test-packages
 
 # Python's packages are downloaded and unpacked while Rust's are compiled.
 build: prerequisites ## virtual environment, SUMO, all programs, the Python extension
@@ -117,9 +117,11 @@ image: ## a container image of Containerfile, by podman, buildah or docker
 test-rust: programs-and-tests
 	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} $(CARGO) test $(CARGO_FLAGS) --no-fail-fast --tests
 
-# One pytest each: test modules of different packages may share names.
-test-python:
+test-trainer:
 	$(VENV)/bin/python -m pytest -q trainer/tests
+
+# One pytest each: test modules of different packages may share names.
+test-packages:
 	$(VENV)/bin/python -m pytest -q bench/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
