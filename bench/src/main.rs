@@ -9,6 +9,7 @@ mod driving;
 mod endurance;
 mod envs;
 mod fanout;
+mod guard;
 mod ipc;
 mod lidar;
 mod overhead;
@@ -56,7 +57,12 @@ pub struct BenchOptions {
 }
 
 fn main() -> ExitCode {
-    match bench(&BenchArgs::parse()) {
+    // Wrong arguments are refused, and the help is printed, without another process.
+    let args = BenchArgs::parse();
+    if let Some(code) = guard::measured_elsewhere() {
+        return code;
+    }
+    match bench(&args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(exit) => exit.report(),
     }

@@ -2,7 +2,16 @@
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
-use std::process::Command;
+use std::{
+    ffi::OsStr,
+    fs,
+    os::unix::ffi::OsStrExt as _,
+    path::Path,
+    process::{Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use rustix::process::{Pid, Signal, kill_process};
 
 fn answer(arguments: &[&str]) -> (Option<i32>, String) {
     let program = env!("CARGO_BIN_EXE_caraware-bench");
@@ -122,5 +131,55 @@ fn disturbed_runs_end_as_if_nothing_had_happened() {
         let may_mount = !report["text"].as_str().unwrap().contains("may not mount");
         let filled = figures.get(&format!("{case}: disk filled")).cloned();
         assert_eq!(filled, may_mount.then(|| 1.0.into()), "{text}");
+    }
+}
+
+/// Command lines of processes that name `directory`, and end with one of these programs.
+fn processes_in(directory: &Path, programs: &[&str]) -> Vec<String> {
+    let entries = fs::read_dir("/proc").unwrap().flatten();
+    let lines = entries.filter_map(|entry| fs::read(entry.path().join("cmdline")).ok());
+    let named = |line: &Vec<u8>| {
+        let program = line.split(|byte| *byte == 0).next().unwrap_or_default();
+        let program = Path::new(OsStr::from_bytes(program)).file_name();
+        let is_one = programs.is_empty() || program.is_some_and(|name| programs.iter().any(|wanted| name == *wanted));
+        is_one
+            && line
+                .windows(directory.as_os_str().len())
+                .any(|part| part == directory.as_os_str().as_bytes())
+    };
+    lines
+        .filter(named)
+        .map(|line| String::from_utf8_lossy(&line).into_owned())
+        .collect()
+}
+
+/// Bare SUMO and whole runs end with the measurement that has started them, and its files are removed.
+#[test]
+fn a_measurement_that_is_stopped_leaves_nothing_behind() {
+    let cases = [
+        ("sumo", Signal::TERM, 143),
+        ("traffic-bridge", Signal::INT, 130),
+        ("traffic-bridge", Signal::HUP, 129),
+    ];
+    for (running, signal, code) in cases {
+        let temporary = tempfile::tempdir().unwrap();
+        let mut bench = Command::new(env!("CARGO_BIN_EXE_caraware-bench"))
+            .args(["overhead", "--quick"])
+            .env("TMPDIR", temporary.path())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let begun = Instant::now();
+        while processes_in(temporary.path(), &[running]).is_empty() {
+            assert!(bench.try_wait().unwrap().is_none() && begun.elapsed() < Duration::from_secs(120));
+            std::thread::park_timeout(Duration::from_millis(5));
+        }
+        kill_process(Pid::from_child(&bench), signal).unwrap();
+        assert_eq!(bench.wait().unwrap().code(), Some(code));
+        let left = processes_in(temporary.path(), &[]);
+        assert!(left.is_empty(), "{signal:?}: {left:?}");
+        let files: Vec<_> = fs::read_dir(temporary.path()).unwrap().flatten().collect();
+        assert!(files.is_empty(), "{signal:?}: {files:?}");
     }
 }
