@@ -52,6 +52,8 @@ ON_SUBLANES = (
 """What the preset `fusion` sets, for a scenario."""
 ESTIMATORS = {"ppo": "policy", "supervised": "regression", "raw_gnss": "raw_gnss", "ekf": "ekf", "map_ekf": "map_ekf"}
 """Names in `report.json`, and of figures."""
+LEARNERS = {key: ESTIMATORS[key] for key in ("ppo", "supervised")}
+PAPER_ESTIMATORS = {key: ESTIMATORS[key] for key in ("ppo", "supervised", "raw_gnss")}
 
 
 class StudyError(Exception):
@@ -94,6 +96,31 @@ def town(options: Options) -> Measured:
     measured = {name: [_error_m(report, key) for report in reports] for key, name in ESTIMATORS.items()}
     pairs = zip(measured["policy"], measured["regression"], strict=True)
     return measured | {"policy_by_regression": [policy / regression for policy, regression in pairs]}
+
+
+def paper(options: Options) -> Measured:
+    """The paper's case study: policy, regression by as many samples and steps, and raw GNSS, by whole runs."""
+    reports = [whole_run(options, f"paper-{seed}", "paper", (f"run.seed={seed}",)) for seed in options.seeds]
+    return {name: [_error_m(report, key) for report in reports] for key, name in PAPER_ESTIMATORS.items()}
+
+
+def camera(options: Options) -> Measured:
+    """Place in the lane and lane from four images, and without images from the fields alone: whole runs of `camera`.
+
+    Both learners see the same traffic.
+    """
+    measured: Measured = {}
+    for seed in options.seeds:
+        reports = {}
+        for eyes, settings in (("images", ()), ("fields", ("trainer.network=mlp",))):
+            own = (f"run.seed={seed}", *settings)
+            reports[eyes] = whole_run(options, f"camera-{eyes}-{seed}", "camera", own)["trainer"]
+        for metric in ("lateral_error_m", "wrong_lane_percent"):
+            for eyes, report in reports.items():
+                for key, name in LEARNERS.items():
+                    measured.setdefault(f"{eyes}.{name}.{metric}", []).append(report[f"{key}_mean_{metric}"])
+            measured.setdefault(f"raw_gnss.{metric}", []).append(reports["images"][f"raw_gnss_mean_{metric}"])
+    return measured
 
 
 def fusion(options: Options) -> Measured:
@@ -194,6 +221,8 @@ TABLES: Mapping[str, Table] = {
     "messages": Table("docs/messages.md", "what to tell others, learnt and by rules", messages),
     "town": Table("docs/baselines.md", "policy and regression by as many samples and steps", town),
     "fusion": Table("docs/fusion.md", "the learned estimator beside the filter that it starts as", fusion),
+    "paper": Table("docs/paper.md", "the paper's case study", paper),
+    "camera": Table("docs/seeing.md", "the lane from images, and without", camera),
     "overhead": Table("docs/benchmarks.md", "co-simulation beside bare `sumo`", overhead),
     "peers": Table("docs/benchmarks.md", "rates beside Python loops over SUMO", peers),
 }
