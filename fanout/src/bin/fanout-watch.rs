@@ -1,5 +1,4 @@
-//! `fanout-watch ENDPOINT RUN [--env N] [--viewers N] [--seconds S] [--bytes-per-s B] [--log FILE]`: viewers that draw nothing. They count
-//! the samples that arrive, that are lost on the way and that must be refused, and print the counts as JSON. For tests and
+//! Viewers that draw nothing: they count the samples that arrive, that are lost on the way and that must be refused. For tests and
 //! `caraware bench fanout`.
 
 use std::{
@@ -17,8 +16,22 @@ use fanout::{
     network::{endpoint, keys::RunKeys, publisher::read_attachment},
     reader,
 };
-use ipc_schema::header::MessageHeader;
+use ipc_schema::{
+    header::MessageHeader,
+    process_main::{answer_help, misused},
+};
 use zenoh::{Wait, sample::Sample};
+
+const USAGE: &str = "\
+usage: fanout-watch ENDPOINT RUN [OPTIONS]
+
+Viewers that draw nothing: they print as JSON how many samples have arrived, were lost, and must be refused.
+
+  --env N          the environment; default 0
+  --viewers N      default 1
+  --seconds S      default 10
+  --bytes-per-s B  speed of the link; 0, the default, leaves it as it is
+  --log FILE       receives a line for each `world` frame: tick, and UNIX time in nanoseconds";
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -224,7 +237,9 @@ fn watch(mut options: WatchOptions) -> Result<(), Failure> {
 }
 
 fn main() -> ExitCode {
-    match WatchOptions::read().and_then(watch) {
+    answer_help(USAGE);
+    let options = WatchOptions::read().unwrap_or_else(|error| misused(&error.to_string(), USAGE));
+    match watch(options) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = writeln!(io::stderr(), "fanout-watch: {error}");

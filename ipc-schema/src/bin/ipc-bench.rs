@@ -1,6 +1,6 @@
 //! Measures the time that a bare iceoryx2 message takes between two processes that busy-poll: the reference of `caraware bench ipc`.
 //!
-//! `ipc-bench [--messages N] --json FILE` starts itself again as the receiving process.
+//! It starts itself again as the receiving process.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,7 +18,18 @@ use iceoryx2::{
     prelude::{FileName, NodeBuilder, Path as IpcPath, SemanticString as _, ServiceName, ipc},
     service::port_factory::publish_subscribe::PortFactory,
 };
-use ipc_schema::clock::monotonic_ns;
+use ipc_schema::{
+    clock::monotonic_ns,
+    process_main::{answer_help, misused},
+};
+
+const USAGE: &str = "\
+usage: ipc-bench [--messages N] --json FILE
+
+Measures the time of a bare iceoryx2 message between two processes: the reference of `caraware bench ipc`.
+
+  --messages N  messages that are measured; default 50000
+  --json FILE   where the times go";
 
 /// Messages before the measurement, while pages and caches warm up.
 const WARM_UP: u64 = 2_000;
@@ -103,20 +114,25 @@ fn send(root: &Path, messages: u64) {
 }
 
 fn main() {
+    answer_help(USAGE);
     let mut messages = 50_000;
     let mut json = None;
     let mut receiver_root: Option<PathBuf> = None;
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
-        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        let mut value = || {
+            arguments
+                .next()
+                .unwrap_or_else(|| misused(&format!("{argument} needs a value"), USAGE))
+        };
         match argument.as_str() {
             "--messages" => messages = value().parse().unwrap(),
             "--json" => json = Some(PathBuf::from(value())),
             "--receive" => receiver_root = Some(value().into()),
-            other => panic!("unknown option {other}"),
+            other => misused(&format!("unknown option {other}"), USAGE),
         }
     }
-    let json = json.unwrap_or_else(|| panic!("--json FILE is needed"));
+    let json = json.unwrap_or_else(|| misused("--json FILE is missing", USAGE));
     if let Some(root) = receiver_root {
         return receive(&root, messages, &json);
     }

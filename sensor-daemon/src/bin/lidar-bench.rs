@@ -1,11 +1,6 @@
 //! Rays per second of the LIDAR on one core, beside general ray tracers in the same run, and its agreement with parry3d.
 //!
-//! `cargo run --release -p sensor-daemon --bin lidar-bench -- [--python PATH] [--path auto|avx512|avx2|plain] [--only CASE]
-//! [--json FILE] [--oracle]`
-//!
-//! `--python` names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs libusb-1.0, libGL and libgomp) and
-//! optionally `embreex`; without it the peers are left out. `--only` measures one case, by its name. `--oracle`
-//! compares fifteen million rays with parry3d instead.
+//! `lidar-bench --help` lists the options. Open3D is `pip install open3d-cpu`; it needs libusb-1.0, libGL and libgomp.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,6 +13,7 @@ use std::path::{Path as FilePath, PathBuf};
 use ipc_schema::{
     config::Config,
     pointcloud::{LidarPoint, Scan},
+    process_main::{answer_help, misused},
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::sensors::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
@@ -29,6 +25,17 @@ use lidar_city::{Moves, SUB_STEPS, oracle};
 #[path = "../../benches/peers/mod.rs"]
 mod peers;
 use peers::{Peers, Scratch, box_of, write_raw};
+
+const USAGE: &str = "\
+usage: lidar-bench [OPTIONS]
+
+Measures rays per second of the LIDAR on one core; `caraware bench lidar` starts it.
+
+  --python PATH                  a Python that can `import open3d`, and perhaps `embreex`: they are measured too
+  --path auto|avx512|avx2|plain  instructions; default auto, the best of this processor
+  --only CASE                    measures one case
+  --json FILE                    where the figures go
+  --oracle                       compares fifteen million rays with parry3d instead";
 
 const CARRIERS: usize = 16;
 const BUILDINGS: usize = 500;
@@ -56,7 +63,11 @@ fn options() -> Options {
     };
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
-        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        let mut value = || {
+            arguments
+                .next()
+                .unwrap_or_else(|| misused(&format!("{argument} needs a value"), USAGE))
+        };
         match argument.as_str() {
             "--python" => options.python = Some(value().into()),
             "--only" => options.only = Some(value()),
@@ -67,11 +78,11 @@ fn options() -> Options {
                     "avx512" => ScanPath::Avx512,
                     "avx2" => ScanPath::Avx2,
                     "plain" => ScanPath::Plain,
-                    other => panic!("--path {other}: auto, avx512, avx2 or plain"),
+                    other => misused(&format!("--path {other}: auto, avx512, avx2 or plain"), USAGE),
                 }
             }
             "--oracle" => options.is_oracle = true,
-            other => panic!("unknown option {other}"),
+            other => misused(&format!("unknown option {other}"), USAGE),
         }
     }
     assert!(options.path.is_here(), "this processor has no {:?}", options.path);
@@ -79,6 +90,7 @@ fn options() -> Options {
 }
 
 fn main() {
+    answer_help(USAGE);
     let options = options();
     if options.is_oracle {
         return hold_against_parry(options.path);

@@ -1,6 +1,10 @@
 //! Bad input is refused with its file, key or line, with the fix and with the right exit code, and nothing is left behind.
 
-use std::{net::TcpListener, process::Stdio};
+use std::{
+    net::TcpListener,
+    path::Path,
+    process::{Command, Stdio},
+};
 
 use crate::common::{Workplace, sumo_program, text, tool, tree};
 
@@ -20,6 +24,35 @@ fn refused(workplace: &Workplace, arguments: &[&str], exit_code: i32) -> String 
 fn assert_says(said: &str, parts: &[&str]) {
     for part in parts {
         assert!(said.contains(part), "`{part}` is not in: {said}");
+    }
+}
+
+/// Also those that people rarely start by hand.
+#[test]
+fn every_program_says_how_it_is_used() {
+    let programs = [
+        "caraware",
+        "caraware-bench",
+        "fanout",
+        "fanout-watch",
+        "ipc-bench",
+        "lidar-bench",
+        "recorder",
+        "replay",
+        "sensor-daemon",
+        "sights-bench",
+        "sim-core",
+        "traffic-bridge",
+        "v2x",
+        "v2x-bench",
+    ];
+    let directory = Path::new(env!("CARGO_BIN_EXE_caraware")).parent().unwrap();
+    for program in programs {
+        let output = Command::new(directory.join(program)).arg("--help").output().unwrap();
+        let said = text(&output);
+        assert!(output.status.success(), "{program}: {said}");
+        assert!(said.to_lowercase().contains("usage: "), "{program}: {said}");
+        assert!(said.contains(program.trim_end_matches("-bench")), "{program}: {said}");
     }
 }
 

@@ -1,9 +1,6 @@
 //! Images and radar scans per second of one core: 500 buildings, 200 moving vehicles, 16 carriers; and images beside general renderers.
 //!
-//! `cargo run --release -p sensor-daemon --bin sights-bench -- camera|radar [--python PATH] [--quick] [--json FILE]`
-//!
-//! `--python` names an interpreter that can `import open3d` and `import mujoco` (`make peers`); without it the peers are left out. Times
-//! are of the thread's processor time, because other work may run on the machine.
+//! `sights-bench --help` lists the options. Times are of the thread's processor time, because other work may run on the machine.
 
 #![allow(
     clippy::unwrap_used,
@@ -13,6 +10,8 @@
 
 use std::path::PathBuf;
 
+use ipc_schema::process_main::{answer_help, misused};
+
 mod camera;
 mod city;
 #[path = "../../../tests/lidar_city/mod.rs"]
@@ -20,6 +19,15 @@ mod lidar_city;
 #[path = "../../../benches/peers/mod.rs"]
 mod peers;
 mod radar;
+
+const USAGE: &str = "\
+usage: sights-bench camera|radar [OPTIONS]
+
+Measures images or radar scans per second of one core; `caraware bench camera` and `bench radar` start it.
+
+  --python PATH  a Python that can `import open3d` and `import mujoco` (`make peers`): they are measured too
+  --quick        a small measurement, whose figures say nothing
+  --json FILE    where the figures go";
 
 /// How much is measured.
 struct BenchSize {
@@ -44,22 +52,28 @@ fn now_s() -> f64 {
 }
 
 fn main() {
+    answer_help(USAGE);
     let mut arguments = std::env::args().skip(1);
     let part = arguments.next();
     let (mut python, mut json, mut size) = (None::<PathBuf>, None::<PathBuf>, BenchSize::FULL);
     while let Some(argument) = arguments.next() {
-        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        let mut value = || {
+            arguments
+                .next()
+                .unwrap_or_else(|| misused(&format!("{argument} needs a value"), USAGE))
+        };
         match argument.as_str() {
             "--python" => python = Some(value().into()),
             "--json" => json = Some(value().into()),
             "--quick" => size = BenchSize::QUICK,
-            other => panic!("unknown option {other}"),
+            other => misused(&format!("unknown option {other}"), USAGE),
         }
     }
     let report = match part.as_deref() {
         Some("camera") => camera::measure(python.as_deref(), &size),
         Some("radar") => radar::measure(&size),
-        other => panic!("{other:?} is neither camera nor radar"),
+        Some(other) => misused(&format!("{other} is neither camera nor radar"), USAGE),
+        None => misused("camera or radar is missing", USAGE),
     };
     if let Some(file) = json {
         std::fs::write(&file, format!("{report:#}\n")).unwrap_or_else(|error| panic!("{}: {error}", file.display()));

@@ -1,8 +1,7 @@
 //! Delivery over distance, channel load, age of information and awareness in a grid of streets with houses between them; and its cost.
 //!
-//! `v2x-bench [--quick] [--json FILE]` writes the figures of `caraware bench v2x`. `v2x-bench cost [STATIONS …] [--threads=N] [--cam]` measures
-//! the cost of the exchange: CAMs alone, then CAMs and CPMs (not with `--cam`). Its hash is over every block of neighbours: what is computed
-//! in another way has the same.
+//! `v2x-bench --help` lists the options. The hash of a cost is over every block of neighbours: what is computed in another way has the
+//! same.
 
 #![expect(
     clippy::unwrap_used,
@@ -14,7 +13,20 @@ mod cost;
 mod curves;
 mod street;
 
+const USAGE: &str = "\
+usage: v2x-bench [--quick] [--json FILE]
+       v2x-bench cost [STATIONS …] [--threads=N] [--cam]
+
+Measures messages between vehicles in streets with houses; `caraware bench v2x` starts it. `cost` measures what
+the exchange costs: CAMs alone, then CAMs and CPMs.
+
+  --quick      a small measurement, whose figures say nothing
+  --json FILE  where the figures go
+  --threads=N  of the exchange
+  --cam        leaves CPMs out";
+
 fn main() {
+    ipc_schema::process_main::answer_help(USAGE);
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match arguments.first().map(String::as_str) {
         Some("cost") => cost::measure_all(&arguments[1..]),
