@@ -21,7 +21,7 @@ EXTRAS ?= envs,data,metrics,study
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
-# Rust's tests, the trainer's and those of the other Python packages run side by side: all start whole runs, which wait a lot.
+# Most of Rust's tests, the trainer's, and all others run side by side: all start whole runs, which wait a lot.
 test: prerequisites browser $(VENV)/.sumo ## all tests
 	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/.installed programs-and-tests
 	$(EXTENSION)
@@ -115,13 +115,17 @@ image: ## a container image of Containerfile, by podman, buildah or docker
 # A test thread more than cores: most tests start whole runs, which wait for each other much of the time. `--tests` leaves out
 # documentation tests, of which no crate has any.
 test-rust: programs-and-tests
-	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} $(CARGO) test $(CARGO_FLAGS) --no-fail-fast --tests
+	RUST_TEST_THREADS=$${RUST_TEST_THREADS:-$$(($$(nproc) + 1))} $(CARGO) test $(CARGO_FLAGS) --no-fail-fast --tests -- --skip $(ENDURANCE)
+
+# It waits for minutes, and would wait alone at the end of the others.
+ENDURANCE = disturbed_runs_end_as_if_nothing_had_happened
 
 test-trainer:
 	$(VENV)/bin/python -m pytest -q trainer/tests
 
 # One pytest each: test modules of different packages may share names.
-test-packages:
+test-packages: programs-and-tests
+	$(CARGO) test $(CARGO_FLAGS) --test command_line $(ENDURANCE)
 	$(VENV)/bin/python -m pytest -q bench/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
