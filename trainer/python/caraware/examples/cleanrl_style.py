@@ -4,6 +4,7 @@ Two things differ from the usual single file: rows without a vehicle (`mask`) ar
 truncated trajectory is worth what its last observation (`final_obs`) promises, a terminated one nothing more.
 """
 
+import math
 import sys
 from dataclasses import dataclass
 
@@ -29,17 +30,20 @@ class Settings:
     gae_lambda: float = 0.95
     clip: float = 0.2
     entropy: float = 0.001
+    initial_std: float = 1.0
+    """Standard deviation of the first actions; much less for driving."""
+    seed: int = 1
 
 
 class Agent(nn.Module):
     """Gaussian policy and value."""
 
-    def __init__(self, fields: int, actions: int) -> None:
+    def __init__(self, fields: int, actions: int, initial_std: float) -> None:
         super().__init__()
         self.mean = nn.Sequential(
             nn.Linear(fields, 256), nn.Tanh(), nn.Linear(256, 128), nn.Tanh(), nn.Linear(128, actions)
         )
-        self.log_std = nn.Parameter(torch.zeros(actions))
+        self.log_std = nn.Parameter(torch.full((actions,), math.log(initial_std)))
         self.critic = nn.Sequential(nn.Linear(fields, 128), nn.Tanh(), nn.Linear(128, 1))
 
     def policy(self, observation: Tensor) -> torch.distributions.Normal:
@@ -130,12 +134,12 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, batch: Collected, set
 def main(steps: int, settings: Settings | None = None, config: str = "town", **changes: object) -> list[float]:
     """Learns for `steps` env-steps; the mean error before each update, metres (0 in the driving task)."""
     settings, errors_m, done = settings or Settings(), [], 0
-    torch.manual_seed(1)
+    torch.manual_seed(settings.seed)
     torch.set_num_threads(1)  # of two cores the simulation needs one; torch's idle threads would spin on it
-    with make(config, changes) as simulation:
+    with make(config, changes, seed=settings.seed) as simulation:
         env = CarAwareVectorEnv(simulation)
         run = env.slots.settings
-        agent = Agent(run.fields.width, run.task.actions.size)
+        agent = Agent(run.fields.width, run.task.actions.size, settings.initial_std)
         optimizer = torch.optim.Adam(agent.parameters(), settings.learning_rate)
         observation, infos = env.reset()
         mask = infos["mask"]
