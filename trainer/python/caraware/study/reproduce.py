@@ -102,7 +102,8 @@ def main(arguments: Sequence[str]) -> int:
     for name, values in measured.items():
         quoted = expected.get(name)
         interval = f"{quoted.low:g} … {quoted.high:g}" if quoted else "none"
-        print(f"{name:36} {mean_interval(values)}   n = {len(values)}   interval {interval}")
+        mean = str(mean_interval(values)) if len(values) > 1 else f"{values[0]:.3f}"
+        print(f"{name:36} {mean}   n = {len(values)}   interval {interval}")
     wrong = compare(measured, expected)
     for line in wrong:
         print(f"error: {line}", file=sys.stderr)
