@@ -14,16 +14,18 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 SETTINGS = {"trainer.network": "mlp", "fanout.enabled": "false"}
 """Beside the preset `driving`: the two others have no encoder of groups."""
-HORIZON, BATCH_SIZE, EPOCHS, LEARNING_RATE, DISCOUNT, GAE_LAMBDA = 16_384, 2048, 3, 3e-4, 0.99, 0.97
-"""Those of the preset."""
-HEROES = 16
-INITIAL_STD = 0.36
+PRESET = tomllib.loads((Path(__file__).parents[1] / "configs" / "driving.toml").read_text())
+OURS = PRESET["trainer"]
+"""What our PPO learns with. The others take it over."""
+HEROES = PRESET["traffic"]["heroes"]
+TICKS = OURS["horizon"] // HEROES
 MEAN_OF = 15
 """Updates of which a point of the image is the mean."""
 NAMES = {"ours": "CarAware", "sb3": "Stable-Baselines3", "cleanrl": "CleanRL's style"}
@@ -103,13 +105,13 @@ def sb3(curve: Curve, seed: int) -> None:
         model = PPO(
             "MlpPolicy",
             CarAwareVecEnv(simulation),
-            learning_rate=LEARNING_RATE,
-            n_steps=HORIZON // HEROES,
-            batch_size=BATCH_SIZE,
-            n_epochs=EPOCHS,
-            gamma=DISCOUNT,
-            gae_lambda=GAE_LAMBDA,
-            policy_kwargs={"net_arch": [128, 128], "log_std_init": math.log(INITIAL_STD)},
+            learning_rate=OURS["learning_rate"],
+            n_steps=TICKS,
+            batch_size=OURS["batch_size"],
+            n_epochs=OURS["epochs"],
+            gamma=OURS["discount"],
+            gae_lambda=OURS["gae_lambda"],
+            policy_kwargs={"net_arch": OURS["hidden"], "log_std_init": math.log(OURS["initial_std"])},
             seed=seed,
             device="cpu",
         )
@@ -128,14 +130,14 @@ def cleanrl(curve: Curve, seed: int) -> None:
             return len(text)
 
     settings = Settings(
-        ticks=HORIZON // HEROES,
-        batch_size=BATCH_SIZE,
-        epochs=EPOCHS,
-        learning_rate=LEARNING_RATE,
-        discount=DISCOUNT,
-        gae_lambda=GAE_LAMBDA,
-        entropy=0.0,
-        initial_std=INITIAL_STD,
+        ticks=TICKS,
+        batch_size=OURS["batch_size"],
+        epochs=OURS["epochs"],
+        learning_rate=OURS["learning_rate"],
+        discount=OURS["discount"],
+        gae_lambda=OURS["gae_lambda"],
+        entropy=OURS["entropy_scale"],
+        initial_std=OURS["initial_std"],
         seed=seed,
     )
     with contextlib.redirect_stdout(Printed()):

@@ -6,6 +6,7 @@ failure is reported once, in `<run>/logs/trainer.error.json`.
 """
 
 import gc
+import importlib
 import json
 import logging
 import os
@@ -152,11 +153,10 @@ def _import_torch() -> None:
     """
     gc.disable()
     try:
-        import torch
+        importlib.import_module("torch")
     finally:
         gc.freeze()
         gc.enable()
-    del torch
 
 
 def read_run(run_file: Path) -> RunFile:
