@@ -16,7 +16,7 @@ PREFIX ?=
 EXTRAS ?= envs,data,metrics,study
 
 .PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-trainer test-packages \
-	timed-packages timed-programs with-cuda newcomer model miri deny bench peers peers-metadrive peers-smarts faces site clean
+	timed-packages timed-programs with-cuda newcomer model miri deny bench peers peers-metadrive peers-smarts faces puffer site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -215,6 +215,17 @@ faces: build ## RLlib for `caraware.examples.rllib_ppo`, in an environment of it
 		> $$(.venv-faces/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
 	.venv-faces/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r trainer/requirements-faces.txt
 
+# With NO_OCEAN, PufferLib's setup.py neither compiles its games nor downloads libraries for them. But then it reads a list that only the
+# games define, so Python gets an empty one. The kernel fits the project's torch alone: pip keeps no wheel of it, and `--clear` makes it anew.
+puffer: build ## PufferLib for `caraware.examples.puffer_ppo`, in an environment of its own that sees the project's packages: 107 MB on disk
+	$(VENV)/bin/python -m venv --clear --without-pip .venv-puffer
+	echo '*' > .venv-puffer/.gitignore
+	($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'; echo "$(CURDIR)/trainer/python"; \
+		echo 'import builtins; builtins.c_extension_paths = []') \
+		> $$(.venv-puffer/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
+	NO_OCEAN=1 $(VENV)/bin/pip --python .venv-puffer/bin/python install --disable-pip-version-check --quiet --progress-bar on \
+		--no-cache-dir --no-deps --no-build-isolation --ignore-installed -r trainer/requirements-puffer.txt
+
 clean:
 	cargo clean
-	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts .venv-faces .venv-site
+	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts .venv-faces .venv-puffer .venv-site
