@@ -27,8 +27,6 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 ARGUMENTS = (
     "--headless=new",
     "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
     "--disable-background-networking",
     "--disable-component-update",
@@ -38,6 +36,13 @@ ARGUMENTS = (
     "--force-device-scale-factor=1",
     "--remote-debugging-pipe",
 )
+RENDERERS = {
+    "software": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    # A graphics card, by OpenGL or Vulkan. There is no display that a surface could be for.
+    "opengl": ("--use-angle=gl-egl",),
+    "vulkan": ("--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface"),
+}
+"""What draws, by its name: arguments of the browser."""
 # rerun's page writes tens of thousands of debug messages, each of which would travel through the pipe.
 QUIET = "console.debug = () => {};"
 
@@ -67,7 +72,7 @@ class DrawnFrame:
 class Browser:
     """One page in a browser with a fresh profile. Use as a context manager."""
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, renderer: str = "software") -> None:
         self._profile = tempfile.TemporaryDirectory(prefix="caraware-browser-", ignore_cleanup_errors=True)
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
@@ -80,9 +85,9 @@ class Browser:
             for descriptor, number in zip(ours, (3, 4), strict=True):
                 os.dup2(descriptor, number)
 
-        arguments = [find(), *ARGUMENTS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"]
+        arguments = [*ARGUMENTS, *RENDERERS[renderer], f"--user-data-dir={self._profile.name}"]
         self._process = subprocess.Popen(
-            [*arguments, "about:blank"],
+            [find(), *arguments, f"--window-size={width},{height}", "about:blank"],
             stderr=subprocess.DEVNULL,
             close_fds=False,
             preexec_fn=pass_descriptors,

@@ -6,9 +6,9 @@ A publisher stands in for `fanout` at its default rates, with frames of the leng
 vehicles: of more than fit into a frame, the same ones in every tick. `--city` measures a real run instead: a generated
 city, simulated in real time, all its vehicles sensing.
 
-`--browser` opens the page in a headless Chromium, whose renderer is software. It counts the pictures that differ from
-the one before. Those of the publisher hold the number of their tick, as a row of dots above the map, so that their age
-is known when they are on the screen.
+`--browser` opens the page in a headless Chromium, which draws in software, or by a graphics card with
+`--renderer vulkan`. It counts the pictures that differ from the one before. Those of the publisher hold the number of
+their tick, as a row of dots above the map, so that their age is known when they are on the screen.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pathlib import Path
 import frames
 import numpy as np
 import zenoh
-from browser import Browser, DrawnFrame
+from browser import RENDERERS, Browser, DrawnFrame
 from numpy.typing import NDArray
 from ports import free_port
 
@@ -50,6 +50,13 @@ CODE_BITS = 15
 CODE_X_M = np.linspace(0.1 * SIDE_M, 0.9 * SIDE_M, CODE_BITS + 2)
 """Places of the dots that hold a tick: the first and the last are always there, between them one for each bit."""
 CODE_Y_M = 1.012 * SIDE_M
+RENDERER = """
+(() => {
+  const gl = document.createElement("canvas").getContext("webgl");
+  return gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info").UNMASKED_RENDERER_WEBGL);
+})()
+"""
+"""The name of what draws."""
 TITLE_PX, DARK = 30, 105
 """Height of the bars above the map, and the brightness that dots have and roads have not."""
 
@@ -217,9 +224,11 @@ def measure(options: argparse.Namespace) -> None:
                 time.sleep(0.2)
             assert opened is not None, "the viewer did not start"
             if options.browser:
-                browser = stack.enter_context(Browser(*options.size))
+                width, height = options.size
+                browser = stack.enter_context(Browser(width, height, options.renderer))
                 browser.open(f"{opened[1]}?renderer=webgl")
                 browser.wait_for("window._handle !== undefined", 180)
+                print(f"drawn by {browser.evaluate(RENDERER)}", flush=True)
             begun = time.monotonic()
             while time.monotonic() - begun < options.seconds:
                 row: dict[str, float] = {}
@@ -246,6 +255,7 @@ if __name__ == "__main__":
     parser.add_argument("--interval", type=float, default=10.0, help="seconds of a row")
     parser.add_argument("--city", action="store_true", help="a real run on a generated city")
     parser.add_argument("--browser", action="store_true")
+    parser.add_argument("--renderer", choices=RENDERERS, default="software")
     parser.add_argument("--size", type=int, nargs=2, default=(1000, 640), help="pixels of the page")
     parser.add_argument("--rate", type=float, default=10.0, help="`caraware-viewer --rate`")
     parser.add_argument("--publish", type=int, help=argparse.SUPPRESS)
