@@ -1,17 +1,15 @@
 //! Links between the radios of a tick. Both directions of a link are the same, so each pair of radios is computed once.
 
 use ipc_schema::config::V2xConfig;
-use sensor_daemon::{
-    noise::normals::minus_two_ln,
-    wide::{VectorPath, VectorWork},
-};
+use sensor_daemon::wide::{VectorPath, VectorWork};
 use sim_core::scene::{Grid, shape::Bounds};
 
 use super::{
-    fading,
+    link_power::{LinkPowers, LinkTerms},
     medium::{Medium, MediumLink},
     milliwatts,
     obstruction::{Antenna, LinkObstruction, Obstacles},
+    open_strips::OpenStrips,
     path_loss::{LinkState, decorrelation_m, path_loss_db, shadowing_std_db, vehicle_loss_db},
     shadowing::{ShadowingEnd, ShadowingField},
 };
@@ -35,7 +33,7 @@ pub struct Radio {
 #[derive(Debug, Clone, Copy)]
 struct Witness {
     /// The later slot.
-    slot: usize,
+    slot: u32,
     wall: u32,
 }
 
@@ -71,7 +69,8 @@ impl RadioShadows {
 struct ShadowedPairs<'a> {
     shadows: &'a RadioShadows,
     first: usize,
-    pairs: &'a mut [RadioPair],
+    pairs: &'a [RadioPair],
+    normals: &'a mut Vec<f64>,
 }
 
 impl VectorWork for ShadowedPairs<'_> {
@@ -83,12 +82,12 @@ impl VectorWork for ShadowedPairs<'_> {
         let [obstructed_first, obstructed_second] = &self.shadows.obstructed;
         for pair in self.pairs {
             let second = pair.second as usize;
-            pair.normal = match pair.between.state {
+            self.normals.push(match pair.between.state {
                 LinkState::Clear => clear_first[self.first].normal(&clear_second[second]),
                 LinkState::Vehicles | LinkState::Building => {
                     obstructed_first[self.first].normal(&obstructed_second[second])
                 }
-            };
+            });
         }
     }
 }
@@ -97,11 +96,7 @@ impl VectorWork for ShadowedPairs<'_> {
 #[derive(Debug, Clone, Copy)]
 struct RadioPair {
     second: u32,
-    /// Square of the distance on the ground, m².
-    flat2_m2: f64,
     between: LinkObstruction,
-    /// Its standard normal number of shadowing.
-    normal: f64,
 }
 
 /// What a thread uses for one radio after the other.
@@ -109,6 +104,8 @@ struct RadioPair {
 struct PairRoom {
     near: Vec<u64>,
     pairs: Vec<RadioPair>,
+    /// Of `pairs`.
+    terms: LinkTerms,
     witnesses: Vec<Witness>,
 }
 
@@ -120,10 +117,11 @@ pub struct LinkComputer {
     /// Power below which a link does not count, dBm.
     least_dbm: f64,
     /// By state of the link: path loss at 1 m, and for each decade of distance, dB.
-    losses_db: [[f32; 2]; 3],
+    losses_db: [[f64; 2]; 3],
     path: VectorPath,
     /// By slot, ascending by the later slot.
     witnesses: Vec<Vec<Witness>>,
+    strips: OpenStrips,
 }
 
 /// The radios of a tick and what is between them.
@@ -141,6 +139,8 @@ pub struct RadioTick<'a> {
 struct PairTurn {
     links: Vec<MediumLink>,
     witnesses: Vec<Witness>,
+    /// The farthest pair without a building between, of those that share no strip.
+    apart: Option<(f64, u32)>,
 }
 
 impl LinkComputer {
@@ -154,10 +154,11 @@ impl LinkComputer {
             least_dbm: medium.irrelevant_dbm(),
             losses_db: [LinkState::Clear, LinkState::Vehicles, LinkState::Building].map(|state| {
                 let [near, far] = [1.0, 10.0].map(|distance_m| path_loss_db(config.path_loss, state, distance_m));
-                [near as f32, (far - near) as f32]
+                [near, far - near]
             }),
             path: VectorPath::widest(),
             witnesses: Vec::new(),
+            strips: OpenStrips::default(),
         }
     }
 
@@ -171,6 +172,7 @@ impl LinkComputer {
             .map(|radio| PairTurn {
                 links: Vec::new(),
                 witnesses: std::mem::take(&mut self.witnesses[radio.slot]),
+                apart: None,
             })
             .collect();
         let shadows = match self.config.fading {
@@ -182,6 +184,7 @@ impl LinkComputer {
             .map(|radio| Bounds::about(radio.antenna.position_m, 0.0))
             .collect();
         let index = Grid::new(&bounds, 0.25 * self.config.range_m);
+        self.strips.enter(tick.obstacles, radios);
         let this = &*self;
         let threads = this.config.threads as usize;
         parallel::for_each_with(threads, &mut turns, PairRoom::default, |room, first, turn| {
@@ -191,11 +194,19 @@ impl LinkComputer {
                 this.path.run(ShadowedPairs {
                     shadows: &shadows,
                     first,
-                    pairs: &mut room.pairs,
+                    pairs: &room.pairs,
+                    normals: &mut room.terms.normal,
                 });
+            } else {
+                room.terms.normal.resize(room.pairs.len(), 0.0);
             }
             this.link(&tick, first, turn, room);
         });
+        let apart = (0..).zip(&turns).filter_map(|(first, turn): (usize, &PairTurn)| {
+            let place = |radio: usize| radios[radio].antenna.position_m;
+            turn.apart.map(|(_, second)| [place(first), place(second as usize)])
+        });
+        self.strips.grow(tick.obstacles, apart);
         // By radio: first those before it, then those after it.
         let mut links: Vec<Vec<MediumLink>> = vec![Vec::new(); radios.len()];
         for (first, turn) in turns.into_iter().enumerate() {
@@ -227,6 +238,7 @@ impl LinkComputer {
             }
         });
         room.pairs.clear();
+        room.terms.clear();
         room.witnesses.clear();
         let mut before = turn.witnesses.iter().peekable();
         for (place, mut word) in room.near.iter().copied().enumerate() {
@@ -236,8 +248,9 @@ impl LinkComputer {
                 let b = &tick.radios[second];
                 if !sends && !tick.sends[second] {
                     // What is known of it is kept.
-                    while before.next_if(|witness| witness.slot < b.slot).is_some() {}
-                    room.witnesses.extend(before.next_if(|witness| witness.slot == b.slot));
+                    while before.next_if(|witness| (witness.slot as usize) < b.slot).is_some() {}
+                    room.witnesses
+                        .extend(before.next_if(|witness| witness.slot as usize == b.slot));
                     continue;
                 }
                 let [dx, dy] = [
@@ -248,10 +261,10 @@ impl LinkComputer {
                 if flat2_m2 <= self.config.range_m * self.config.range_m {
                     room.pairs.push(RadioPair {
                         second: second as u32,
-                        flat2_m2,
                         between: LinkObstruction::CLEAR,
-                        normal: 0.0,
                     });
+                    room.terms.flat2_m2.push(flat2_m2);
+                    room.terms.height_m.push(b.antenna.z_m - a.z_m);
                 }
             }
         }
@@ -263,25 +276,38 @@ impl LinkComputer {
         let mut before = turn.witnesses.iter().peekable();
         let mut kept = room.witnesses.iter().peekable();
         let mut witnesses = Vec::with_capacity(turn.witnesses.len() + 16);
-        for pair in &mut room.pairs {
+        for (pair, flat2_m2) in room.pairs.iter_mut().zip(&room.terms.flat2_m2) {
             let Radio { slot, antenna: b, .. } = &tick.radios[pair.second as usize];
-            while let Some(witness) = kept.next_if(|witness| witness.slot < *slot) {
+            while let Some(witness) = kept.next_if(|witness| (witness.slot as usize) < *slot) {
                 witnesses.push(*witness);
             }
-            while before.next_if(|witness| witness.slot < *slot).is_some() {}
-            let known = before.next_if(|witness| witness.slot == *slot);
+            while before.next_if(|witness| (witness.slot as usize) < *slot).is_some() {}
+            if let Some(shared) = self.strips.shared(first, pair.second as usize) {
+                let top_m = self.strips.highest_vehicle_m(&shared, tick.obstacles, a, b);
+                pair.between = LinkObstruction::behind(top_m, a, b);
+                continue;
+            }
+            let known = before.next_if(|witness| witness.slot as usize == *slot);
             let wall = known
                 .and_then(|witness| tick.obstacles.wall_beside(witness.wall, a, b))
                 .or_else(|| tick.obstacles.wall_between(a, b));
             pair.between = match wall {
                 Some(wall) => {
-                    witnesses.push(Witness { slot: *slot, wall });
+                    witnesses.push(Witness {
+                        slot: *slot as u32,
+                        wall,
+                    });
                     LinkObstruction {
                         state: LinkState::Building,
                         above: [true; 2],
                     }
                 }
-                None => tick.obstacles.vehicles_between(a, b),
+                None => {
+                    if turn.apart.is_none_or(|(farthest2_m2, _)| *flat2_m2 > farthest2_m2) {
+                        turn.apart = Some((*flat2_m2, pair.second));
+                    }
+                    tick.obstacles.vehicles_between(a, b)
+                }
             };
         }
         witnesses.extend(kept);
@@ -289,38 +315,74 @@ impl LinkComputer {
     }
 
     /// Makes links of the pairs that count.
-    fn link(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &PairRoom) {
+    fn link(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &mut PairRoom) {
         let a = &tick.radios[first];
-        for pair in &room.pairs {
-            if self.config.fading && self.is_surely_weak(pair) {
+        let PairRoom { pairs, terms, .. } = room;
+        for pair in &*pairs {
+            let [at_1_m_db, decade_db] = self.losses_db[pair.between.state as usize];
+            let [vehicles_db, behind] = self.behind_vehicles(a, &tick.radios[pair.second as usize], pair.between);
+            terms.at_1_m_dbm.push(self.config.power_dbm - at_1_m_db);
+            terms.decade_db.push(decade_db);
+            terms.shadowing_db.push(match self.config.fading {
+                true => shadowing_std_db(pair.between.state),
+                false => 0.0,
+            });
+            terms.vehicles_db.push(vehicles_db);
+            terms.behind.push(behind);
+        }
+        self.path.run(LinkPowers {
+            terms,
+            least_dbm: self.least_dbm,
+        });
+        for (place, (pair, power_mw)) in pairs.iter().zip(&terms.power_mw).enumerate() {
+            // Most pairs do not count.
+            if *power_mw == 0.0 {
                 continue;
             }
-            let b = &tick.radios[pair.second as usize];
-            let distance_m = (pair.flat2_m2 + (b.antenna.z_m - a.antenna.z_m).powi(2)).sqrt();
-            if let Some(power_dbm) = self.power_dbm([a, b], pair.between, distance_m, || pair.normal) {
-                turn.links.push(MediumLink {
-                    radio: pair.second,
-                    power_mw: milliwatts(power_dbm) as f32,
-                    twice_shape: if self.config.fading {
-                        fading::twice_shape(distance_m)
-                    } else {
-                        0
-                    },
-                });
-            }
+            let power_mw = match power_mw.is_nan() {
+                false => *power_mw,
+                true => {
+                    let b = &tick.radios[pair.second as usize];
+                    let distance_m = (terms.flat2_m2[place] + terms.height_m[place].powi(2)).sqrt();
+                    match self.power_dbm([a, b], pair.between, distance_m, || terms.normal[place]) {
+                        Some(power_dbm) => milliwatts(power_dbm) as f32,
+                        None => continue,
+                    }
+                }
+            };
+            turn.links.push(MediumLink {
+                radio: pair.second,
+                power_mw,
+                twice_shape: if self.config.fading {
+                    terms.twice_shape[place]
+                } else {
+                    0
+                },
+            });
         }
     }
 
-    /// True if a pair does not count, by more than f32 may be wrong: most pairs, which need no exact logarithm. What height and vehicles
-    /// add to its loss is left out.
-    fn is_surely_weak(&self, pair: &RadioPair) -> bool {
-        const ERROR_DB: f32 = 0.01;
-        let state = pair.between.state;
-        let [at_1_m, decade] = self.losses_db[state as usize];
-        let log10 = -0.5 * std::f32::consts::LOG10_E * minus_two_ln((pair.flat2_m2 as f32).max(1.0));
-        let mean_dbm = self.config.power_dbm as f32 - (at_1_m + 0.5 * decade * log10);
-        let shadowing_db = shadowing_std_db(state) as f32 * pair.normal as f32;
-        mean_dbm + shadowing_db < self.least_dbm as f32 - ERROR_DB
+    /// Loss of a link behind vehicles with its random part, without what distance adds, dB; and 1 if distance adds to it, else 0.
+    fn behind_vehicles(&self, a: &Radio, b: &Radio, between: LinkObstruction) -> [f64; 2] {
+        if between.state != LinkState::Vehicles {
+            return [0.0; 2];
+        }
+        let [mean_db, std_db] = vehicle_loss_db(between.above, 1.0);
+        let behind = if std_db > 0.0 { 1.0 } else { 0.0 };
+        [mean_db + std_db * self.blocking(a, b), behind]
+    }
+
+    /// Standard normal number of the loss of a link behind vehicles.
+    fn blocking(&self, a: &Radio, b: &Radio) -> f64 {
+        let key = LinkKey {
+            sender: a.station,
+            receiver: b.station,
+            message: 0,
+        };
+        match self.config.fading {
+            true => f64::from(self.random.normals(key, RadioDraw::Blocking, 0)[0]),
+            false => 0.0,
+        }
     }
 
     /// Power of a link, dBm, if it counts. `shadowing` is its standard normal number.
@@ -342,16 +404,7 @@ impl LinkComputer {
         }
         if between.state == LinkState::Vehicles {
             let [mean_db, std_db] = vehicle_loss_db(between.above, distance_m);
-            let key = LinkKey {
-                sender: a.station,
-                receiver: b.station,
-                message: 0,
-            };
-            let normal = match self.config.fading {
-                true => f64::from(self.random.normals(key, RadioDraw::Blocking, 0)[0]),
-                false => 0.0,
-            };
-            power_dbm -= (mean_db + std_db * normal).max(0.0);
+            power_dbm -= (mean_db + std_db * self.blocking(a, b)).max(0.0);
         }
         (power_dbm >= self.least_dbm).then_some(power_dbm)
     }

@@ -2,9 +2,11 @@
 
 pub mod delivery;
 pub mod fading;
+mod link_power;
 pub mod links;
 pub mod medium;
 pub mod obstruction;
+pub mod open_strips;
 pub mod path_loss;
 pub mod reception;
 pub mod shadowing;

@@ -44,6 +44,18 @@ impl LinkObstruction {
         state: LinkState::Clear,
         above: [true; 2],
     };
+
+    /// Road users, of which this is the top of the highest, metres.
+    #[must_use]
+    pub fn behind(top_m: Option<f64>, a: &Antenna, b: &Antenna) -> Self {
+        match top_m {
+            None => Self::CLEAR,
+            Some(top_m) => Self {
+                state: LinkState::Vehicles,
+                above: [a.z_m > top_m, b.z_m > top_m],
+            },
+        }
+    }
 }
 
 /// A wall of a building.
@@ -177,13 +189,7 @@ impl Obstacles {
     /// What is between two antennas that no building obstructs.
     #[must_use]
     pub fn vehicles_between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
-        match self.highest_vehicle_m(a, b) {
-            None => LinkObstruction::CLEAR,
-            Some(top_m) => LinkObstruction {
-                state: LinkState::Vehicles,
-                above: [a.z_m > top_m, b.z_m > top_m],
-            },
-        }
+        LinkObstruction::behind(self.highest_vehicle_m(a, b), a, b)
     }
 
     /// True if a building meets the line between two antennas.
@@ -244,19 +250,45 @@ impl Obstacles {
                 let circle = &self.circles[*row as usize];
                 // Most are beside the line.
                 let area = cross(way, from_to(a.position_m, circle.centre_m));
-                if area * area > circle.radius2_m2 * length2 {
-                    continue;
-                }
-                if *row == a.row || *row == b.row || top_m.is_some_and(|top| circle.top_m <= top) {
-                    continue;
-                }
-                if meets_box(&self.bodies[*row as usize], a, b) {
-                    top_m = Some(circle.top_m);
+                if area * area <= circle.radius2_m2 * length2 {
+                    top_m = self.higher_of(top_m, *row, a, b);
                 }
             }
             ControlFlow::Continue(())
         });
         top_m
+    }
+
+    /// The higher of a top and that of a road user, if the road user meets the line between two antennas.
+    #[inline]
+    pub(super) fn higher_of(&self, top_m: Option<f64>, row: u32, a: &Antenna, b: &Antenna) -> Option<f64> {
+        let body_top_m = self.circles[row as usize].top_m;
+        let counts = row != a.row && row != b.row && top_m.is_none_or(|top_m| body_top_m > top_m);
+        match counts && meets_box(&self.bodies[row as usize], a, b) {
+            true => Some(body_top_m),
+            false => top_m,
+        }
+    }
+
+    /// Both ends of the walls of the buildings near `bounds`, into `found`; some come several times.
+    pub(super) fn walls_near(&self, bounds: &Bounds, found: &mut Vec<[Point; 2]>) {
+        found.clear();
+        self.building_grid.visit_near(bounds, |buildings| {
+            for building in buildings.iter().map(|number| &self.buildings[*number as usize]) {
+                let walls = &self.walls[building.walls.start as usize..building.walls.end as usize];
+                found.extend(walls.iter().map(|wall| [wall.from_m, wall.to_m]));
+            }
+        });
+    }
+
+    /// Calls `visit` with row, centre and radius of circles about the bodies near `bounds`, with some several times.
+    pub(super) fn visit_circles(&self, bounds: &Bounds, mut visit: impl FnMut(u32, Point, f64)) {
+        self.vehicles.visit_near(bounds, |rows| {
+            for row in rows {
+                let circle = &self.circles[*row as usize];
+                visit(*row, circle.centre_m, circle.radius2_m2.sqrt());
+            }
+        });
     }
 }
 

@@ -107,7 +107,9 @@ pub fn measure_all(arguments: &[String]) {
         .find_map(|argument| argument.strip_prefix("--threads="));
     let threads = threads.map_or(1, |count| count.parse().unwrap());
     for stations in counts {
-        measure(stations, 0.0, threads);
+        if !arguments.iter().any(|argument| argument == "--cpm") {
+            measure(stations, 0.0, threads);
+        }
         if !arguments.iter().any(|argument| argument == "--cam") {
             measure(stations, 80.0, threads);
         }
