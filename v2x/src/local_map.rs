@@ -7,6 +7,7 @@ use std::{
 };
 
 use ipc_schema::neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighbourSource};
+use sensor_daemon::wide::{VectorPath, VectorWork};
 
 /// Two objects nearer to each other than this are one, unless both spoke for themselves, metres. It is about half a car's length.
 pub const SAME_OBJECT_M: f64 = 2.5;
@@ -69,132 +70,383 @@ impl KnownObject {
     }
 }
 
-/// Everything that was heard lately. Many stations hear the same message: their maps refer to one copy of its objects.
+/// Everything that was heard lately. Many stations hear the same message, and a map only has which messages its station received: what
+/// they say is here once, and is looked up when a map is read.
 ///
 /// Each station that sends has a few slots, and each of its objects keeps one as long as anything that was heard of it lives: the station
-/// itself the first. So a map finds what it knows of an object by its slot, without a search.
-#[derive(Debug, Clone, Default)]
+/// itself the first.
+#[derive(Debug, Clone)]
 pub struct HeardObjects {
     objects: VecDeque<KnownObject>,
-    /// Slot and time of each, in the same order.
-    entries: VecDeque<HeardEntry>,
-    /// Numbers of the oldest object and of the next: they are counted from the first one of the episode, and begin again at 0 behind
-    /// [`NO_OBJECT`].
+    /// Numbers of the oldest object and of the next: they are counted from the first one of the episode, and begin again at 0.
     first: u32,
     next: u32,
     /// Where each is now, metres.
     now_m: Vec<[f64; 2]>,
-    /// The same from the origin.
-    about_now_m: Vec<[f32; 2]>,
-    /// By station.
-    senders: BTreeMap<u32, SenderSlots>,
+    /// Stations that send. A place among them is used again when all that was heard of its station is forgotten.
+    senders: Vec<HeardSender>,
+    /// Places by station.
+    places: BTreeMap<u32, u32>,
+    unused: Vec<u32>,
+    /// Words of the bits of each sender's messages.
+    words: usize,
+    /// What maps read: as of the last [`HeardObjects::advance`].
+    now: HeardNow,
     /// Objects that were measured before this time are in no map, ms.
     lives_from_ms: i64,
     /// Place of the first object: f32 is exact to millimetres about it.
     origin_m: Option<[f64; 2]>,
 }
 
-/// What a map needs of an object that it hears of.
-#[derive(Debug, Clone, Copy)]
-struct HeardEntry {
-    measured_ms: i64,
-    /// Nothing that was heard of it before was measured later.
-    is_newest: bool,
-    /// Station that it was heard from.
+impl Default for HeardObjects {
+    fn default() -> Self {
+        Self {
+            objects: VecDeque::new(),
+            first: 0,
+            next: 0,
+            now_m: Vec::new(),
+            senders: Vec::new(),
+            places: BTreeMap::new(),
+            unused: Vec::new(),
+            words: 1,
+            now: HeardNow::default(),
+            lives_from_ms: NEVER_MS,
+            origin_m: None,
+        }
+    }
+}
+
+/// A message that was heard.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HeardMessage {
+    /// Numbers of its objects.
+    pub objects: Range<u32>,
+    /// Place of its station among those that send, and the message's bit there.
     sender: u32,
-    /// Its slot there.
-    slot: u32,
+    bit: u32,
 }
 
-/// Slots of a station that sends.
+/// A station that sends.
 #[derive(Debug, Clone)]
-struct SenderSlots {
+struct HeardSender {
+    station: u32,
     slots: Vec<SenderSlot>,
-    /// When the newest of its objects was measured, ms.
-    newest_ms: i64,
+    /// Bits of messages that are in use.
+    used: Vec<u64>,
 }
 
-#[derive(Debug, Clone, Copy)]
+/// An object of a station that sends.
+#[derive(Debug, Clone)]
 struct SenderSlot {
     /// Number of the object at the station.
     object: u32,
-    /// When it was measured at last, ms.
-    newest_ms: i64,
+    /// What was said of it, ascending by the time of the measurement, then in the order in which it was heard.
+    views: Vec<SlotView>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct SlotView {
+    measured_ms: i64,
+    /// The object.
+    number: u32,
+    /// Bit of its message.
+    bit: u32,
+}
+
+/// What maps read at a tick, packed.
+#[derive(Debug, Clone, Default)]
+struct HeardNow {
+    /// By place: bits of the messages that live.
+    alive: Vec<u64>,
+    /// By place.
+    senders: Vec<SenderNow>,
+    /// By slot: bits of the messages with something of it, and the first of its views, with one more behind the last slot.
+    slot_bits: Vec<u64>,
+    slot_views: Vec<u32>,
+    /// By slot: about its views.
+    slot_circles: Vec<AboutCircle>,
+    /// By slot, the newest first.
+    views: Vec<ViewNow>,
+}
+
+/// What a station that sends has said.
+#[derive(Debug, Clone, Copy)]
+struct SenderNow {
+    /// Its slots among all.
+    from: u32,
+    to: u32,
+    /// About the objects that it perceives.
+    perceived: AboutCircle,
+}
+
+/// A box about places, from the origin, metres.
+#[derive(Debug, Clone, Copy)]
+struct AboutBox {
+    least_m: [f32; 2],
+    most_m: [f32; 2],
+}
+
+impl AboutBox {
+    const EMPTY: Self = Self {
+        least_m: [f32::INFINITY; 2],
+        most_m: [f32::NEG_INFINITY; 2],
+    };
+
+    fn with(&mut self, other: &Self) {
+        for axis in 0..2 {
+            self.least_m[axis] = self.least_m[axis].min(other.least_m[axis]);
+            self.most_m[axis] = self.most_m[axis].max(other.most_m[axis]);
+        }
+    }
+
+    /// The circle about it; nothing is in that of an empty one.
+    fn circle(&self) -> AboutCircle {
+        let [half_x_m, half_y_m] = [0, 1].map(|axis: usize| 0.5 * (self.most_m[axis] - self.least_m[axis]));
+        match half_x_m >= 0.0 {
+            true => AboutCircle {
+                centre_m: [self.least_m[0] + half_x_m, self.least_m[1] + half_y_m],
+                radius_m: (half_x_m * half_x_m + half_y_m * half_y_m).sqrt(),
+            },
+            false => AboutCircle {
+                centre_m: [f32::INFINITY; 2],
+                radius_m: 0.0,
+            },
+        }
+    }
+}
+
+/// A circle about places, from the origin, metres.
+#[derive(Debug, Clone, Copy)]
+struct AboutCircle {
+    centre_m: [f32; 2],
+    radius_m: f32,
+}
+
+impl AboutCircle {
+    /// Square of the distance from a point to the centre, m².
+    #[inline(always)]
+    fn away2_m2(&self, from_m: [f32; 2]) -> f32 {
+        let [x, y] = [self.centre_m[0] - from_m[0], self.centre_m[1] - from_m[1]];
+        x * x + y * y
+    }
+
+    /// True if all of it is farther from a point than `reach_m`.
+    #[inline(always)]
+    fn is_beyond(&self, from_m: [f32; 2], reach_m: f32) -> bool {
+        let reach_m = reach_m + self.radius_m;
+        self.away2_m2(from_m) > reach_m * reach_m
+    }
+}
+
+/// What a map knows of the objects that others perceive, without those farther than `reach_m` and those that are surely one of the
+/// stations at `spoke_m`: numbers into `found`.
+struct NearPerceived<'a> {
+    map: &'a LocalMap,
+    heard: &'a HeardObjects,
+    words: usize,
+    from_m: [f32; 2],
+    reach_m: f32,
+    /// x and y in whole vectors; the last one is filled up with places where nothing is.
+    spoke_m: &'a [[[f32; LANES]; 2]],
+    found: &'a mut Vec<u32>,
+}
+
+/// Places nearer to each other than this are surely the same.
+const SAME_M: f32 = SAME_OBJECT_M as f32 - ROUNDING_M;
+/// Stations that are compared at once.
+const LANES: usize = 8;
+
+impl VectorWork for NearPerceived<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let (now, words) = (&self.heard.now, self.words);
+        for (sender, received) in self.map.heard_from(self.heard, words) {
+            if sender.perceived.is_beyond(self.from_m, self.reach_m) {
+                continue;
+            }
+            // The first slot is the station itself.
+            for slot in sender.from as usize + 1..sender.to as usize {
+                if now.slot_circles[slot].is_beyond(self.from_m, self.reach_m) {
+                    continue;
+                }
+                if let Some(view) = now.newest(slot, received, words)
+                    && !is_one_of(view.about_m, self.spoke_m)
+                {
+                    self.found.push(view.number);
+                }
+            }
+        }
+    }
+}
+
+/// True if a place is surely that of one of these stations.
+#[inline(always)]
+fn is_one_of([x, y]: [f32; 2], spoke_m: &[[[f32; LANES]; 2]]) -> bool {
+    let mut least2 = [f32::INFINITY; LANES];
+    for [xs, ys] in spoke_m {
+        for lane in 0..LANES {
+            let (dx, dy) = (xs[lane] - x, ys[lane] - y);
+            let away2 = dx * dx + dy * dy;
+            least2[lane] = if away2 < least2[lane] { away2 } else { least2[lane] };
+        }
+    }
+    let mut same = 0_u32;
+    for away2 in least2 {
+        same |= u32::from(away2 < SAME_M * SAME_M);
+    }
+    same != 0
+}
+
+/// What a message said of an object.
+#[derive(Debug, Clone, Copy)]
+struct ViewNow {
+    bit: u32,
+    number: u32,
+    /// Where that is now, from the origin, metres.
+    about_m: [f32; 2],
+}
+
+impl HeardNow {
+    /// The newest view of a slot in the messages of these bits.
+    #[inline(always)]
+    fn newest(&self, slot: usize, received: &[u64], words: usize) -> Option<&ViewNow> {
+        let bits = &self.slot_bits[slot * words..(slot + 1) * words];
+        if !share_a_bit(bits, received, words) {
+            return None;
+        }
+        let views = self.slot_views[slot] as usize..self.slot_views[slot + 1] as usize;
+        self.views[views]
+            .iter()
+            .find(|view| received[view.bit as usize / 64] >> (view.bit % 64) & 1 == 1)
+    }
+}
+
+/// True if there is a bit in both.
+#[inline(always)]
+fn share_a_bit(a: &[u64], b: &[u64], words: usize) -> bool {
+    let mut shared = 0;
+    for word in 0..words {
+        shared |= a[word] & b[word];
+    }
+    shared != 0
 }
 
 /// No object was heard of yet.
 const NEVER_MS: i64 = i64::MIN;
 
-impl Default for SenderSlots {
-    fn default() -> Self {
+impl HeardSender {
+    fn new(station: u32, words: usize) -> Self {
         // The station itself.
         let own = SenderSlot {
             object: 0,
-            newest_ms: NEVER_MS,
+            views: Vec::new(),
         };
         Self {
+            station,
             slots: vec![own],
-            newest_ms: NEVER_MS,
+            used: vec![0; words],
         }
     }
-}
 
-impl SenderSlots {
     /// The slot of an object: its own, or one whose object is in no map any more.
-    fn slot_of(&mut self, object: u32, lives_from_ms: i64) -> usize {
-        if let Some(slot) = self.slots.iter().position(|slot| slot.object == object) {
-            return slot;
-        }
-        let taken = SenderSlot {
-            object,
-            newest_ms: NEVER_MS,
+    fn slot_of(&mut self, object: u32, lives_from_ms: i64) -> &mut SenderSlot {
+        let own = self.slots.iter().position(|slot| slot.object == object);
+        let is_free = |slot: &SenderSlot| {
+            slot.object != 0 && slot.views.last().is_none_or(|view| view.measured_ms < lives_from_ms)
         };
-        let is_free = |slot: &SenderSlot| slot.object != 0 && slot.newest_ms < lives_from_ms;
-        match self.slots.iter().position(is_free) {
-            Some(slot) => {
-                self.slots[slot] = taken;
-                slot
-            }
-            None => {
-                self.slots.push(taken);
-                self.slots.len() - 1
-            }
+        let place = own.or_else(|| self.slots.iter().position(is_free)).unwrap_or_else(|| {
+            self.slots.push(SenderSlot {
+                object,
+                views: Vec::new(),
+            });
+            self.slots.len() - 1
+        });
+        let slot = &mut self.slots[place];
+        if slot.object != object {
+            slot.object = object;
+            slot.views.clear();
         }
+        slot
+    }
+
+    /// A bit that no message has.
+    fn unused_bit(&self) -> Option<u32> {
+        let (place, word) = (0_u32..).zip(&self.used).find(|(_, word)| **word != u64::MAX)?;
+        Some(64 * place + word.trailing_ones())
     }
 }
 
 impl HeardObjects {
-    /// Adds the objects of a message; returns their numbers.
-    pub fn add(&mut self, objects: &[KnownObject]) -> Range<u32> {
-        // One number is that of no object.
-        if self.next.checked_add(objects.len() as u32).is_none() {
-            objects.iter().for_each(|object| self.push(*object));
-        }
+    /// Adds a message with these objects, all of one station.
+    pub fn add(&mut self, objects: &[KnownObject]) -> HeardMessage {
         let from = self.next;
-        objects.iter().for_each(|object| self.push(*object));
-        from..self.next
+        let Some(station) = objects.first().map(|object| object.heard_from) else {
+            return HeardMessage {
+                objects: from..from,
+                sender: 0,
+                bit: 0,
+            };
+        };
+        let place = self.place_of(station);
+        let sender = &mut self.senders[place as usize];
+        let bit = match sender.unused_bit() {
+            Some(bit) => bit,
+            None => {
+                let bit = 64 * self.words as u32;
+                self.words += 1;
+                self.senders.iter_mut().for_each(|sender| sender.used.push(0));
+                bit
+            }
+        };
+        let sender = &mut self.senders[place as usize];
+        sender.used[bit as usize / 64] |= 1 << (bit % 64);
+        self.origin_m.get_or_insert(objects[0].position_m);
+        for object in objects {
+            let views = &mut sender.slot_of(object.object, self.lives_from_ms).views;
+            let behind = views
+                .iter()
+                .rev()
+                .take_while(|view| view.measured_ms > object.measured_ms);
+            let view = SlotView {
+                measured_ms: object.measured_ms,
+                number: self.next,
+                bit,
+            };
+            views.insert(views.len() - behind.count(), view);
+            self.objects.push_back(*object);
+            self.next = self.next.wrapping_add(1);
+        }
+        HeardMessage {
+            objects: from..self.next,
+            sender: place,
+            bit,
+        }
     }
 
-    fn push(&mut self, object: KnownObject) {
-        let (sender, measured_ms) = (object.heard_from, object.measured_ms);
-        self.origin_m.get_or_insert(object.position_m);
-        let slots = self.senders.entry(sender).or_default();
-        slots.newest_ms = slots.newest_ms.max(measured_ms);
-        let number = slots.slot_of(object.object, self.lives_from_ms);
-        let slot = &mut slots.slots[number];
-        self.entries.push_back(HeardEntry {
-            measured_ms,
-            is_newest: measured_ms >= slot.newest_ms,
-            sender,
-            slot: number as u32,
-        });
-        slot.newest_ms = slot.newest_ms.max(measured_ms);
-        self.objects.push_back(object);
-        self.next = self.next.wrapping_add(1);
+    /// The place of a station among those that send, a new one if it has none.
+    fn place_of(&mut self, station: u32) -> u32 {
+        let Self {
+            senders, unused, words, ..
+        } = self;
+        *self.places.entry(station).or_insert_with(|| {
+            let sender = HeardSender::new(station, *words);
+            match unused.pop() {
+                Some(place) => {
+                    senders[place as usize] = sender;
+                    place
+                }
+                None => {
+                    senders.push(sender);
+                    senders.len() as u32 - 1
+                }
+            }
+        })
     }
 
-    /// Moves every object to its place at `now_ms`, and gives up the oldest ones that were measured more than `lifetime_ms` ago: no map
-    /// refers to them after [`LocalMap::forget`].
+    /// Moves every object to its place at `now_ms`, and forgets what was measured more than `lifetime_ms` ago. Every map has to take what its
+    /// station received ([`LocalMap::receive`]) before the next message is added.
     pub fn advance(&mut self, now_ms: i64, lifetime_ms: i64) {
         self.lives_from_ms = now_ms - lifetime_ms;
         let lives_from_ms = self.lives_from_ms;
@@ -204,25 +456,76 @@ impl HeardObjects {
             .is_some_and(|object| object.measured_ms < lives_from_ms)
         {
             self.objects.pop_front();
-            self.entries.pop_front();
             self.first = self.first.wrapping_add(1);
         }
-        self.senders.retain(|_, slots| slots.newest_ms >= lives_from_ms);
         self.now_m.clear();
         self.now_m
             .extend(self.objects.iter().map(|object| object.position_at_m(now_ms)));
+        self.pack();
+    }
+
+    /// Packs what lives for the maps.
+    fn pack(&mut self) {
         let origin_m = self.origin_m.unwrap_or_default();
-        self.about_now_m.clear();
-        self.about_now_m.extend(
-            self.now_m
-                .iter()
-                .map(|place| [(place[0] - origin_m[0]) as f32, (place[1] - origin_m[1]) as f32]),
-        );
+        let words = self.words;
+        let now = &mut self.now;
+        now.alive.clear();
+        now.senders.clear();
+        now.slot_bits.clear();
+        now.slot_views.clear();
+        now.slot_circles.clear();
+        now.views.clear();
+        for (place, sender) in (0_u32..).zip(&mut self.senders) {
+            let from = now.slot_views.len() as u32;
+            let mut perceived = AboutBox::EMPTY;
+            sender.used.fill(0);
+            for (number, slot) in sender.slots.iter_mut().enumerate() {
+                let dead = slot.views.partition_point(|view| view.measured_ms < self.lives_from_ms);
+                slot.views.drain(..dead);
+                let bits_from = now.slot_bits.len();
+                now.slot_bits.resize(bits_from + words, 0);
+                now.slot_views.push(now.views.len() as u32);
+                let mut around = AboutBox::EMPTY;
+                for view in slot.views.iter().rev() {
+                    now.slot_bits[bits_from + view.bit as usize / 64] |= 1 << (view.bit % 64);
+                    let at_m = self.now_m[view.number.wrapping_sub(self.first) as usize];
+                    let about_m = [(at_m[0] - origin_m[0]) as f32, (at_m[1] - origin_m[1]) as f32];
+                    now.views.push(ViewNow {
+                        bit: view.bit,
+                        number: view.number,
+                        about_m,
+                    });
+                    around.with(&AboutBox {
+                        least_m: about_m,
+                        most_m: about_m,
+                    });
+                }
+                now.slot_circles.push(around.circle());
+                if number > 0 {
+                    perceived.with(&around);
+                }
+                for (used, bits) in sender.used.iter_mut().zip(&now.slot_bits[bits_from..]) {
+                    *used |= bits;
+                }
+            }
+            now.senders.push(SenderNow {
+                from,
+                to: now.slot_views.len() as u32,
+                perceived: perceived.circle(),
+            });
+            now.alive.extend_from_slice(&sender.used);
+            let is_silent = sender.used.iter().all(|word| *word == 0);
+            if is_silent && self.places.get(&sender.station) == Some(&place) {
+                self.places.remove(&sender.station);
+                self.unused.push(place);
+            }
+        }
+        now.slot_views.push(now.views.len() as u32);
     }
 
     /// The objects of these numbers, which have not been given up.
     pub fn of(&self, numbers: Range<u32>) -> impl Iterator<Item = &KnownObject> {
-        numbers.map(|number| self.object(number))
+        numbers_of(numbers).map(|number| self.object(number))
     }
 
     /// Forgets everything.
@@ -230,179 +533,146 @@ impl HeardObjects {
         *self = Self::default();
     }
 
-    /// Its place among those that live.
-    fn place(&self, number: u32) -> usize {
-        number.wrapping_sub(self.first) as usize
-    }
-
     /// The object of this number, which no map has forgotten.
     fn object(&self, number: u32) -> &KnownObject {
-        &self.objects[self.place(number)]
-    }
-
-    /// What maps need of the object of this number.
-    fn entry(&self, number: u32) -> &HeardEntry {
-        &self.entries[self.place(number)]
+        &self.objects[number.wrapping_sub(self.first) as usize]
     }
 
     /// Its place at the time of the last [`HeardObjects::advance`], metres.
     fn now_m(&self, number: u32) -> [f64; 2] {
-        self.now_m[self.place(number)]
+        self.now_m[number.wrapping_sub(self.first) as usize]
     }
 }
 
-/// Number of no object.
-const NO_OBJECT: u32 = u32::MAX;
-/// Slots of a block are a multiple of this.
-const BLOCK_SLOTS: usize = 4;
+/// Numbers from one to another, which may begin again at 0 in between.
+fn numbers_of(numbers: Range<u32>) -> impl Iterator<Item = u32> {
+    (0..numbers.end.wrapping_sub(numbers.start)).map(move |place| numbers.start.wrapping_add(place))
+}
+
 /// More than what a distance in f32 may be wrong by, metres.
 const ROUNDING_M: f32 = 0.25;
 
-/// What a map knows from one station.
-#[derive(Debug, Clone, Copy)]
-struct SenderBlock {
-    /// The station.
-    sender: u32,
-    /// First of its slots in the map.
-    from: u32,
-    slots: u32,
-    /// Nothing in it was measured before this time, ms.
-    oldest_ms: i64,
-}
-
-impl SenderBlock {
-    fn range(&self) -> Range<usize> {
-        self.from as usize..(self.from + self.slots) as usize
-    }
-}
-
-/// The map: for each station that it heard from, the newest object of each of the station's slots.
+/// The map: which of the messages that live the station has received.
 #[derive(Debug, Clone, Default)]
 pub struct LocalMap {
-    /// Ascending by station.
-    blocks: Vec<SenderBlock>,
-    /// Numbers of objects among all that was heard, block by block.
-    numbers: Vec<u32>,
-    /// Places of `numbers` that no block has.
-    unused: usize,
+    /// Places of the stations that it heard from among those that send, ascending.
+    senders: Vec<u32>,
+    /// Bits of the messages from each.
+    received: Vec<u64>,
+    /// Words of bits for each.
+    words: usize,
     /// Objects in it.
     known: usize,
 }
 
 impl LocalMap {
-    /// Takes what a message says of these objects, each unless something newer is known of it.
-    pub fn insert(&mut self, heard: &HeardObjects, numbers: Range<u32>) {
-        let mut place = None;
-        for number in numbers {
-            let entry = heard.entry(number);
-            // All objects of a message are of one station.
-            let block = match place {
-                Some(place) if self.blocks[place as usize].sender == entry.sender => place as usize,
-                _ => self.block_of(entry.sender),
+    /// Takes what the station has received since it did so last, and forgets what is too old, after [`HeardObjects::advance`].
+    pub fn receive<'a>(&mut self, heard: &HeardObjects, messages: impl Iterator<Item = &'a HeardMessage>) {
+        self.widen(heard.words);
+        // One word is enough unless objects live long: the loops over it vanish.
+        match heard.words {
+            1 => self.receive_by_words(heard, messages, 1),
+            words => self.receive_by_words(heard, messages, words),
+        }
+    }
+
+    #[inline(always)]
+    fn receive_by_words<'a>(
+        &mut self,
+        heard: &HeardObjects,
+        messages: impl Iterator<Item = &'a HeardMessage>,
+        words: usize,
+    ) {
+        for message in messages.filter(|message| message.objects.start != message.objects.end) {
+            let place = match self.senders.binary_search(&message.sender) {
+                Ok(place) => place,
+                Err(place) => {
+                    self.senders.insert(place, message.sender);
+                    self.received
+                        .splice(place * words..place * words, std::iter::repeat_n(0, words));
+                    place
+                }
             };
-            place = Some(block as u32);
-            if entry.slot >= self.blocks[block].slots {
-                self.grow(block, entry.slot as usize + 1);
-            }
-            let block = &mut self.blocks[block];
-            block.oldest_ms = block.oldest_ms.min(entry.measured_ms);
-            let known = &mut self.numbers[(block.from + entry.slot) as usize];
-            if *known == NO_OBJECT {
-                self.known += 1;
-                *known = number;
-            } else if entry.is_newest || heard.entry(*known).measured_ms <= entry.measured_ms {
-                *known = number;
-            }
+            self.received[place * words + message.bit as usize / 64] |= 1 << (message.bit % 64);
         }
+        let now = &heard.now;
+        let (mut kept, mut known) = (0, 0);
+        for place in 0..self.senders.len() {
+            let sender = self.senders[place] as usize;
+            let mut any = 0;
+            for word in 0..words {
+                let alive = self.received[place * words + word] & now.alive[sender * words + word];
+                self.received[kept * words + word] = alive;
+                any |= alive;
+            }
+            if any == 0 {
+                continue;
+            }
+            self.senders[kept] = sender as u32;
+            let received = &self.received[kept * words..(kept + 1) * words];
+            let SenderNow { from, to, .. } = now.senders[sender];
+            let slots = now.slot_bits[from as usize * words..to as usize * words].chunks_exact(words);
+            for bits in slots {
+                known += usize::from(share_a_bit(bits, received, words));
+            }
+            kept += 1;
+        }
+        self.senders.truncate(kept);
+        self.received.truncate(kept * words);
+        self.known = known;
     }
 
-    /// The place of a station's block, a new one if there is none.
-    fn block_of(&mut self, sender: u32) -> usize {
-        match self.blocks.binary_search_by_key(&sender, |block| block.sender) {
-            Ok(place) => place,
-            Err(place) => {
-                let block = SenderBlock {
-                    sender,
-                    from: self.numbers.len() as u32,
-                    slots: 0,
-                    oldest_ms: i64::MAX,
-                };
-                self.blocks.insert(place, block);
-                place
-            }
+    /// Makes room for more bits of each sender.
+    fn widen(&mut self, words: usize) {
+        if self.words == words {
+            return;
         }
+        let mut received = vec![0; self.senders.len() * words];
+        for place in 0..self.senders.len() {
+            let from = place * self.words..(place + 1) * self.words;
+            received[place * words..][..self.words].copy_from_slice(&self.received[from]);
+        }
+        (self.received, self.words) = (received, words);
     }
 
-    /// Moves a block behind the last, with at least `slots` slots.
-    fn grow(&mut self, place: usize, slots: usize) {
-        let block = &mut self.blocks[place];
-        let (old, from) = (block.range(), self.numbers.len());
-        self.unused += old.len();
-        let slots = slots.next_multiple_of(BLOCK_SLOTS);
-        (block.from, block.slots) = (from as u32, slots as u32);
-        self.numbers.extend_from_within(old);
-        self.numbers.resize(from + slots, NO_OBJECT);
-    }
-
-    /// Forgets what was measured more than `lifetime_ms` ago.
-    pub fn forget(&mut self, heard: &HeardObjects, now_ms: i64, lifetime_ms: i64) {
-        let lives_from_ms = now_ms - lifetime_ms;
-        let (numbers, known, unused) = (&mut self.numbers, &mut self.known, &mut self.unused);
-        self.blocks.retain_mut(|block| {
-            if block.oldest_ms >= lives_from_ms {
-                return true;
-            }
-            block.oldest_ms = i64::MAX;
-            for number in &mut numbers[block.range()] {
-                if *number == NO_OBJECT {
-                    continue;
-                }
-                let measured_ms = heard.entry(*number).measured_ms;
-                if measured_ms < lives_from_ms {
-                    *number = NO_OBJECT;
-                    *known -= 1;
-                } else {
-                    block.oldest_ms = block.oldest_ms.min(measured_ms);
-                }
-            }
-            let is_empty = block.oldest_ms == i64::MAX;
-            *unused += if is_empty { block.slots as usize } else { 0 };
-            !is_empty
-        });
-        if 2 * self.unused > self.numbers.len() {
-            self.compact();
-        }
-    }
-
-    /// Gives up what no block uses.
-    fn compact(&mut self) {
-        let mut numbers = Vec::with_capacity(self.numbers.len() - self.unused);
-        for block in &mut self.blocks {
-            let from = numbers.len() as u32;
-            numbers.extend_from_slice(&self.numbers[block.range()]);
-            block.from = from;
-        }
-        (self.numbers, self.unused) = (numbers, 0);
+    /// Stations that it heard from: what each has said, and the bits of the messages that were received.
+    #[inline(always)]
+    fn heard_from<'a>(
+        &'a self,
+        heard: &'a HeardObjects,
+        words: usize,
+    ) -> impl Iterator<Item = (&'a SenderNow, &'a [u64])> {
+        let senders = self.senders.iter().map(|sender| &heard.now.senders[*sender as usize]);
+        senders.zip(self.received.chunks_exact(words))
     }
 
     /// Every known object, each station's view of it by itself, by station and slot.
     pub fn all<'a>(&'a self, heard: &'a HeardObjects) -> impl Iterator<Item = &'a KnownObject> {
-        let numbers = self.blocks.iter().flat_map(|block| &self.numbers[block.range()]);
-        numbers
-            .filter(|number| **number != NO_OBJECT)
-            .map(|number| heard.object(*number))
+        let station = |sender: u32| heard.senders[sender as usize].station;
+        let mut senders: Vec<(&SenderNow, &[u64])> = Vec::with_capacity(self.senders.len());
+        senders.extend(self.heard_from(heard, heard.words));
+        let mut order: Vec<(u32, usize)> = self.senders.iter().map(|sender| station(*sender)).zip(0..).collect();
+        order.sort_unstable();
+        order.into_iter().flat_map(move |(_, place)| {
+            let (sender, received) = senders[place];
+            let newest = move |slot: u32| heard.now.newest(slot as usize, received, heard.words);
+            (sender.from..sender.to)
+                .filter_map(newest)
+                .map(|view| heard.object(view.number))
+        })
     }
 
     /// Number of stations that it knows something from.
     #[must_use]
     pub fn stations(&self) -> usize {
-        self.blocks.len()
+        self.senders.len()
     }
 
     /// True if it knows something from this station.
     #[must_use]
-    pub fn has_heard(&self, station: u32) -> bool {
-        self.blocks.binary_search_by_key(&station, |block| block.sender).is_ok()
+    pub fn has_heard(&self, heard: &HeardObjects, station: u32) -> bool {
+        let place = heard.places.get(&station);
+        place.is_some_and(|place| self.senders.binary_search(place).is_ok())
     }
 
     /// Number of known objects, each station's view of an object counted.
@@ -429,44 +699,53 @@ impl LocalMap {
         nearest: &mut Vec<&'a KnownObject>,
     ) {
         nearest.clear();
+        match heard.words {
+            1 => self.nearest_by_words(heard, from_m, count, nearest, 1),
+            words => self.nearest_by_words(heard, from_m, count, nearest, words),
+        }
+    }
+
+    #[inline(always)]
+    fn nearest_by_words<'a>(
+        &self,
+        heard: &'a HeardObjects,
+        from_m: [f64; 2],
+        count: usize,
+        nearest: &mut Vec<&'a KnownObject>,
+        words: usize,
+    ) {
         let Some(origin_m) = heard.origin_m else { return };
         let about_from_m = [0, 1].map(|axis: usize| (from_m[axis] - origin_m[axis]) as f32);
         let same2 = SAME_OBJECT_M * SAME_OBJECT_M;
         let away2 = |number: u32| distance2(heard.now_m(number), from_m);
         // Its own word comes before another's at nearly the same place: those that spoke for themselves are chosen first.
-        let mut chosen = self.nearest_own(heard, about_from_m, count, away2);
+        let mut chosen = self.nearest_own(heard, about_from_m, count, away2, words);
         let spoke = chosen.len();
-        let spoke_m: Vec<[f32; 2]> = chosen
-            .iter()
-            .map(|(_, number)| {
-                let place = heard.now_m(*number);
-                [0, 1].map(|axis: usize| (place[axis] - from_m[axis]) as f32)
-            })
-            .collect();
+        let mut spoke_m = vec![[[f32::INFINITY; LANES]; 2]; spoke.div_ceil(LANES)];
+        for (place, (_, number)) in chosen.iter().enumerate() {
+            for axis in 0..2 {
+                let at_m = heard.now_m(*number)[axis] - origin_m[axis];
+                spoke_m[place / LANES][axis][place % LANES] = at_m as f32;
+            }
+        }
         // Behind `count` of them no other is listed.
         let farthest2 = chosen
             .get(count.wrapping_sub(1))
             .map_or(f64::INFINITY, |(away2, _)| *away2);
-        let about_farthest2 = (farthest2.sqrt() as f32 + ROUNDING_M).powi(2);
-        let about_same2 = (SAME_OBJECT_M as f32 - ROUNDING_M).powi(2);
-        let mut perceived = Vec::new();
-        for block in &self.blocks {
-            for number in &self.numbers[block.range()][1..] {
-                if *number == NO_OBJECT {
-                    continue;
-                }
-                let [x, y] = heard.about_now_m[heard.place(*number)];
-                let [x, y] = [x - about_from_m[0], y - about_from_m[1]];
-                let is_same = |place: &[f32; 2]| (x - place[0]).powi(2) + (y - place[1]).powi(2) < about_same2;
-                if x * x + y * y > about_farthest2 || spoke_m.iter().any(is_same) {
-                    continue;
-                }
-                let away2 = away2(*number);
-                if away2 > same2 && away2 <= farthest2 {
-                    perceived.push((away2, *number));
-                }
-            }
-        }
+        let mut found = Vec::new();
+        VectorPath::widest().run(NearPerceived {
+            map: self,
+            heard,
+            words,
+            from_m: about_from_m,
+            reach_m: farthest2.sqrt() as f32 + ROUNDING_M,
+            spoke_m: &spoke_m,
+            found: &mut found,
+        });
+        let found = found.into_iter().map(|number| (away2(number), number));
+        let mut perceived: Vec<(f64, u32)> = found
+            .filter(|(away2, _)| *away2 > same2 && *away2 <= farthest2)
+            .collect();
         let mut rest = &mut perceived[..];
         'all: while !rest.is_empty() {
             let part = nearest_first(rest, count);
@@ -490,24 +769,42 @@ impl LocalMap {
         nearest.extend(chosen.into_iter().take(count).map(|(_, number)| heard.object(number)));
     }
 
-    /// The `count` nearest of the stations that spoke for themselves, with the squares of their distances. They have the first slot of
-    /// their block.
+    /// The `count` nearest of the stations that spoke for themselves, with the squares of their distances. They have their
+    /// first slot.
+    #[inline(always)]
     fn nearest_own(
         &self,
         heard: &HeardObjects,
         from_m: [f32; 2],
         count: usize,
         away2: impl Fn(u32) -> f64,
+        words: usize,
     ) -> Vec<(f64, u32)> {
-        let own = self.blocks.iter().map(|block| self.numbers[block.from as usize]);
-        let about_away2 = |number: u32| {
-            let [x, y] = heard.about_now_m[heard.place(number)];
-            (x - from_m[0]).powi(2) + (y - from_m[1]).powi(2)
-        };
-        let mut about: Vec<(f32, u32)> = own
-            .filter(|number| *number != NO_OBJECT)
-            .map(|number| (about_away2(number), number))
-            .collect();
+        let mut near: Vec<(f32, u32, &[u64])> = Vec::with_capacity(self.senders.len());
+        for (sender, received) in self.heard_from(heard, words) {
+            let slot = sender.from as usize;
+            if share_a_bit(&heard.now.slot_bits[slot * words..(slot + 1) * words], received, words) {
+                near.push((heard.now.slot_circles[slot].away2_m2(from_m), sender.from, received));
+            }
+        }
+        if count < near.len() {
+            // What is farther than `count` others surely are is not among them.
+            let radius_m = |slot: u32| heard.now.slot_circles[slot as usize].radius_m;
+            let (nearer, last, _) = near.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0));
+            let reaches = nearer
+                .iter()
+                .chain([&*last])
+                .map(|(away2, slot, _)| away2.sqrt() + radius_m(*slot));
+            let reach_m = reaches.fold(0.0, f32::max) + 2.0 * ROUNDING_M;
+            near.retain(|(away2, slot, _)| *away2 <= (reach_m + radius_m(*slot)).powi(2));
+        }
+        let mut about: Vec<(f32, u32)> = Vec::with_capacity(near.len());
+        for (_, slot, received) in near {
+            if let Some(view) = heard.now.newest(slot as usize, received, words) {
+                let [x, y] = [view.about_m[0] - from_m[0], view.about_m[1] - from_m[1]];
+                about.push((x * x + y * y, view.number));
+            }
+        }
         if count < about.len() {
             let (_, last, _) = about.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0));
             let most2 = (last.0.sqrt() + 2.0 * ROUNDING_M).powi(2);
@@ -570,16 +867,21 @@ mod tests {
 
     /// A map, and what it refers to.
     #[derive(Default)]
-    struct Heard(HeardObjects, LocalMap);
+    struct Heard(HeardObjects, LocalMap, Vec<HeardMessage>);
 
     impl Heard {
         fn insert(&mut self, object: KnownObject) {
-            let numbers = self.0.add(&[object]);
-            self.1.insert(&self.0, numbers);
+            self.2.push(self.0.add(&[object]));
+        }
+
+        fn advance(&mut self, now_ms: i64, lifetime_ms: i64) {
+            self.0.advance(now_ms, lifetime_ms);
+            self.1.receive(&self.0, self.2.iter());
+            self.2.clear();
         }
 
         fn nearest(&mut self, now_ms: i64, count: usize) -> Vec<KnownObject> {
-            self.0.advance(now_ms, i64::MAX / 2);
+            self.advance(now_ms, i64::MAX / 2);
             let mut found = Vec::new();
             self.1.nearest(&self.0, [0.0, 0.0], count, &mut found);
             found.into_iter().copied().collect()
@@ -596,10 +898,10 @@ mod tests {
         heard.insert(object(1, 0, 50.0, 100));
         heard.insert(object(1, 0, 60.0, 200));
         heard.insert(object(1, 0, 70.0, 150));
-        assert_eq!(heard.1.len(), 1);
         let (numbers, ids) = heard.nearest(300, 4)[0].columns(300);
+        assert_eq!(heard.1.len(), 1);
         assert_eq!((numbers[0], numbers[7], ids), (60.0, 0.1, [1, 1, 1]));
-        heard.1.forget(&heard.0, 1701, 1500);
+        heard.advance(1701, 1500);
         assert!(heard.1.is_empty());
     }
 
@@ -679,38 +981,33 @@ mod tests {
             let mut maps = vec![LocalMap::default(); 3];
             let mut lists: Vec<Vec<KnownObject>> = vec![Vec::new(); 3];
             let mut now_ms = 0;
-            let mut messages: Vec<(Range<u32>, Vec<KnownObject>, u8)> = Vec::new();
+            let mut messages: Vec<(HeardMessage, Vec<KnownObject>, u8)> = Vec::new();
             for (later_ms, sent) in ticks {
                 now_ms += later_ms;
+                heard.advance(now_ms, LIFETIME_MS);
                 for (receiver, (map, list)) in maps.iter_mut().zip(&mut lists).enumerate() {
-                    for (numbers, objects, _) in messages.iter().filter(|(_, _, to)| to >> receiver & 1 == 1) {
-                        map.insert(&heard, numbers.clone());
-                        for object in objects {
-                            match list.iter_mut().find(|known| key(known) == key(object)) {
-                                None => list.push(*object),
-                                Some(known) if known.measured_ms <= object.measured_ms => *known = *object,
-                                Some(_) => {}
-                            }
+                    let received = messages.iter().filter(|(_, _, to)| to >> receiver & 1 == 1);
+                    map.receive(&heard, received.clone().map(|(message, _, _)| message));
+                    for object in received.flat_map(|(_, objects, _)| objects) {
+                        match list.iter_mut().find(|known| key(known) == key(object)) {
+                            None => list.push(*object),
+                            Some(known) if known.measured_ms <= object.measured_ms => *known = *object,
+                            Some(_) => {}
                         }
                     }
-                    map.forget(&heard, now_ms, LIFETIME_MS);
                     list.retain(|object| now_ms - object.measured_ms <= LIFETIME_MS);
-                }
-                heard.advance(now_ms, LIFETIME_MS);
-                for (map, list) in maps.iter().zip(&lists) {
-                    let mut known: Vec<KnownObject> = map
-                        .blocks
-                        .iter()
-                        .flat_map(|block| &map.numbers[block.range()])
-                        .filter(|number| **number != NO_OBJECT)
-                        .map(|number| *heard.object(*number))
-                        .collect();
-                    known.sort_by_key(key);
-                    let mut expected = list.clone();
-                    expected.sort_by_key(key);
+                    let known: Vec<KnownObject> = map.all(&heard).copied().collect();
+                    prop_assert!(known.is_sorted_by_key(|object| object.heard_from));
                     prop_assert_eq!(map.len(), known.len());
-                    prop_assert_eq!(known, expected);
-                    prop_assert!(2 * map.unused <= map.numbers.len());
+                    let by_key = |objects: &[KnownObject]| {
+                        let mut sorted = objects.to_vec();
+                        sorted.sort_by_key(key);
+                        sorted
+                    };
+                    prop_assert_eq!(by_key(&known), by_key(list));
+                    let stations = |station: u32| known.iter().any(|object| object.heard_from == station);
+                    prop_assert_eq!((1..5).filter(|station| stations(*station)).count(), map.stations());
+                    prop_assert!((1..5).all(|station| stations(station) == map.has_heard(&heard, station)));
                 }
                 messages.clear();
                 for (sender, content, to) in sent {
@@ -727,12 +1024,28 @@ mod tests {
         fn slots_are_used_again(objects in prop::collection::vec(1_u32..1_000_000, 200)) {
             let (mut heard, mut map) = (HeardObjects::default(), LocalMap::default());
             for (tick, number) in (0_i64..).zip(objects) {
-                let numbers = heard.add(&[object(1, number, 3.0, 100 * tick)]);
-                map.insert(&heard, numbers);
-                map.forget(&heard, 100 * tick, 400);
+                let message = heard.add(&[object(1, number, 3.0, 100 * tick)]);
                 heard.advance(100 * tick, 400);
-                prop_assert!(map.numbers.len() <= 16 && heard.senders[&1].slots.len() <= 8);
+                map.receive(&heard, [message].iter());
+                prop_assert!(map.len() <= 5 && heard.senders.len() == 1 && heard.senders[0].slots.len() <= 8);
+                prop_assert!(heard.words == 1);
             }
+        }
+
+        /// More messages of a station live than one word has bits.
+        #[test]
+        fn messages_may_live_long(heard_by in prop::collection::vec(0_u8..4, 150)) {
+            let (mut heard, mut maps) = (HeardObjects::default(), [LocalMap::default(), LocalMap::default()]);
+            for (tick, to) in (0_u32..).zip(&heard_by) {
+                let message = heard.add(&[object(1, tick + 1, f64::from(tick), 100 * i64::from(tick))]);
+                heard.advance(100 * i64::from(tick), 60_000);
+                for (receiver, map) in maps.iter_mut().enumerate() {
+                    map.receive(&heard, [&message].into_iter().filter(|_| to >> receiver & 1 == 1));
+                    let received = heard_by[..=tick as usize].iter().filter(|to| *to >> receiver & 1 == 1);
+                    prop_assert_eq!(map.len(), received.count());
+                }
+            }
+            prop_assert_eq!(heard.words, 3);
         }
     }
 }

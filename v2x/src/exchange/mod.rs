@@ -2,7 +2,7 @@
 //!
 //! A message is made from what its station measured at a tick. It is sent and received before the next tick, whose `neighbours` show it.
 
-use std::{ops::Range, sync::Arc};
+use std::sync::Arc;
 
 use ipc_schema::{
     config::{Config, RoadsideService, V2xConfig, V2xInclusion, V2xListing},
@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use sim_core::{geodesy::Projection, scene::Scene};
 
 use crate::{
-    local_map::{HeardObjects, KnownObject, LocalMap},
+    local_map::{HeardMessage, HeardObjects, KnownObject, LocalMap},
     message::{
         bsm::BsmCore,
         cam::Cam,
@@ -30,7 +30,7 @@ use crate::{
     radio::{
         delivery::{DecodingTable, Receptions},
         links::{LinkComputer, Radio, RadioTick},
-        medium::{Medium, MediumLink, OnAir, QueuedMessage, Schedule},
+        medium::{Medium, OnAir, QueuedMessage, RadioLinks, Schedule, Transmission},
         noise_dbm,
         obstruction::{Antenna, Obstacles},
     },
@@ -95,15 +95,6 @@ pub struct ExchangeCounts {
     pub roadside_received: u64,
 }
 
-/// A message as its receivers read it.
-#[derive(Debug, Clone)]
-struct HeardMessage {
-    /// Slot of its sender.
-    sender: usize,
-    /// Numbers of its objects among all that was heard.
-    objects: Range<u32>,
-}
-
 /// A message that was on air.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AirPacket {
@@ -145,6 +136,8 @@ pub struct MessageExchange {
     at: usize,
     random: RadioRandom,
     links: LinkComputer,
+    /// Those of the last tick. Kept for their memory.
+    radio_links: RadioLinks,
     /// Slots of the tick.
     slots: usize,
     /// By slot, then by roadside unit; so are `activity`, `inbox` and `rows`.
@@ -152,8 +145,9 @@ pub struct MessageExchange {
     activity: Vec<RadioActivity>,
     /// Objects of the messages that maps may refer to.
     objects: HeardObjects,
-    /// Messages of the tick before.
+    /// Messages of the tick before, and the slots of their senders.
     heard: Vec<HeardMessage>,
+    senders: Vec<usize>,
     /// By slot: the messages that it received in the tick before.
     inbox: Vec<Vec<u32>>,
     /// Row in the world of each slot's vehicle.
@@ -201,6 +195,7 @@ impl MessageExchange {
                 .collect(),
             at: 0,
             links: LinkComputer::new(&v2x, &medium, random),
+            radio_links: RadioLinks::default(),
             medium,
             decoding: DecodingTable::default(),
             random,
@@ -209,6 +204,7 @@ impl MessageExchange {
             activity: vec![RadioActivity::default(); v2x.roadside.len()],
             objects: HeardObjects::default(),
             heard: Vec::new(),
+            senders: Vec::new(),
             inbox: vec![Vec::new(); v2x.roadside.len()],
             rows: Vec::new(),
             air: Vec::new(),
@@ -239,7 +235,7 @@ impl MessageExchange {
 
     /// Slots of the senders of the messages of the last [`MessageExchange::send`], by the beginning of the message.
     pub fn senders(&self) -> impl Iterator<Item = usize> {
-        self.heard.iter().map(|message| message.sender)
+        self.senders.iter().copied()
     }
 
     /// Places among [`MessageExchange::senders`] of the messages that a slot has received, ascending.
@@ -272,15 +268,15 @@ impl MessageExchange {
         }
         let now_ms = (header.sim_time_ns / 1_000_000) as i64;
         let lifetime_ms = (self.config.object_lifetime_s * 1000.0) as i64;
+        self.objects.advance(now_ms, lifetime_ms);
         let (objects, heard, inbox) = (&self.objects, &self.heard, &self.inbox);
         parallel::for_each(self.config.threads as usize, &mut self.stations, |slot, station| {
             let Some(station) = station else { return };
-            for message in inbox.get(slot).into_iter().flatten() {
-                station.map.insert(objects, heard[*message as usize].objects.clone());
-            }
-            station.map.forget(objects, now_ms, lifetime_ms);
+            let received = inbox.get(slot).into_iter().flatten();
+            station
+                .map
+                .receive(objects, received.map(|message| &heard[*message as usize]));
         });
-        self.objects.advance(now_ms, lifetime_ms);
         for (station, activity) in self.stations.iter_mut().zip(&self.activity) {
             if let Some(station) = station {
                 station.congestion.measure(header.sim_time_ns, activity.load.into());
@@ -302,6 +298,7 @@ impl MessageExchange {
         self.activity.fill(RadioActivity::default());
         self.objects.clear();
         self.heard.clear();
+        self.senders.clear();
         self.inbox.iter_mut().for_each(Vec::clear);
     }
 
@@ -438,6 +435,13 @@ impl MessageExchange {
     pub fn send(&mut self, header: &MessageHeader, slots: &[SlotMeasurement], states: &[VehicleState]) {
         self.maps[self.at].obstacles.update(states);
         let radios = self.radios(states);
+        let mut radio_of_row = vec![u32::MAX; states.len()];
+        for (number, radio) in (0_u32..).zip(&radios) {
+            if let Some(of_row) = radio_of_row.get_mut(radio.antenna.row as usize) {
+                *of_row = number;
+            }
+        }
+        self.links.enter(&self.maps[self.at].obstacles, &radios);
         let ExchangeMap {
             obstacles,
             projection,
@@ -455,6 +459,8 @@ impl MessageExchange {
             perception: &self.perception,
             roadside,
             objects: &self.objects,
+            strips: self.links.strips(),
+            radio_of_row: &radio_of_row,
             config: &self.config,
         };
         let outgoing = outgoing(&tick, &radios, &mut self.stations, self.config.threads as usize);
@@ -462,12 +468,15 @@ impl MessageExchange {
         let queue: Vec<QueuedMessage> = outgoing.iter().map(|message| message.queued).collect();
         let mut sends = vec![false; radios.len()];
         queue.iter().for_each(|message| sends[message.radio as usize] = true);
-        let links = self.links.links(RadioTick {
+        let mut links = std::mem::take(&mut self.radio_links);
+        let radio_tick = RadioTick {
             radios: &radios,
             sends: &sends,
             obstacles,
-        });
-        self.counts.links += links.iter().map(|links| links.len() as u64).sum::<u64>();
+        };
+        self.links.links(radio_tick, &mut links);
+        let of_senders = (0..).zip(&sends).filter(|(_, sends)| **sends);
+        self.counts.links += of_senders.map(|(radio, _)| links.of(radio).len() as u64).sum::<u64>();
         let schedule = self.medium.schedule(&queue, &links, &self.random);
         self.deliver(header, &outgoing, &queue, &links, &schedule, &radios);
         self.relay_warnings(&outgoing, &schedule);
@@ -478,6 +487,7 @@ impl MessageExchange {
         for (radio, load) in radios.iter().zip(loads) {
             self.activity[radio.slot].load = load;
         }
+        self.radio_links = links;
     }
 
     /// Gives each roadside unit that sends warnings once more those that it heard.
@@ -546,7 +556,7 @@ impl MessageExchange {
         header: &MessageHeader,
         outgoing: &[OutgoingMessage],
         queue: &[QueuedMessage],
-        links: &[Vec<MediumLink>],
+        links: &RadioLinks,
         schedule: &Schedule,
         radios: &[Radio],
     ) {
@@ -557,8 +567,12 @@ impl MessageExchange {
             links,
             stations: &stations,
         };
-        let decoded =
-            Receptions::new(&self.medium, &self.decoding, on_air, &self.random).decoded(self.config.threads as usize);
+        let mut decoded: Vec<Vec<u32>> = radios
+            .iter()
+            .map(|radio| std::mem::take(&mut self.inbox[radio.slot]))
+            .collect();
+        Receptions::new(&self.medium, &self.decoding, on_air, &self.random)
+            .decode(self.config.threads as usize, &mut decoded);
         let (threads, projection) = (self.config.threads as usize, &self.maps[self.at].projection);
         let listing = self.config.listing;
         let mut contents: Vec<Vec<KnownObject>> = vec![Vec::new(); schedule.on_air.len()];
@@ -567,12 +581,11 @@ impl MessageExchange {
             read_packet(packet, header.sim_time_ns, projection, listing, objects);
         });
         self.heard.clear();
-        for (sent, contents) in schedule.on_air.iter().zip(contents) {
-            self.heard.push(HeardMessage {
-                sender: radios[queue[sent.queued].radio as usize].slot,
-                objects: self.objects.add(&contents),
-            });
-        }
+        self.heard
+            .extend(contents.iter().map(|contents| self.objects.add(contents)));
+        let slot_of = |sent: &Transmission| radios[queue[sent.queued].radio as usize].slot;
+        self.senders.clear();
+        self.senders.extend(schedule.on_air.iter().map(slot_of));
         for sent in &schedule.on_air {
             let message = &queue[sent.queued];
             let slot = radios[message.radio as usize].slot;

@@ -7,7 +7,11 @@ use ipc_schema::{
 };
 use sim_core::geodesy::Projection;
 
-use super::{SlotMeasurement, perception::Observer, size_of};
+use super::{
+    SlotMeasurement,
+    perception::{Observer, ObservingRadio},
+    size_of,
+};
 use crate::{
     local_map::{HeardObjects, KnownObject},
     message::{
@@ -20,6 +24,7 @@ use crate::{
         links::Radio,
         medium::QueuedMessage,
         obstruction::Obstacles,
+        open_strips::OpenStrips,
         reception::{FRAME_BYTES, air_time_s},
     },
     random::RadioRandom,
@@ -129,6 +134,10 @@ pub struct StationTick<'a> {
     pub roadside: &'a [RoadsideUnit],
     /// Everything that was heard lately.
     pub objects: &'a HeardObjects,
+    /// Strips that radios are in.
+    pub strips: &'a OpenStrips,
+    /// By row in the world: the radio of the road user, or `u32::MAX`.
+    pub radio_of_row: &'a [u32],
     /// Which messages are sent.
     pub config: &'a V2xConfig,
 }
@@ -194,7 +203,7 @@ impl StationTurn<'_> {
         if unit.config.offers(RoadsideService::Map) {
             self.generate_map(tick, &composer, unit);
         } else if unit.config.offers(RoadsideService::Cpm) {
-            let observer = Observer::of_roadside(unit, self.station.station, tick);
+            let observer = Observer::of_roadside(unit, self.number, self.station.station, tick);
             self.generate_cpm(tick, &composer, &observer, &unit.perception);
         }
     }
@@ -215,7 +224,7 @@ impl StationTurn<'_> {
             .copied()
             .collect();
         if unit.perception.range_m > 0.0 {
-            let observer = Observer::of_roadside(unit, self.station.station, tick);
+            let observer = Observer::of_roadside(unit, self.number, self.station.station, tick);
             let perceived = composer.own_view(&observer.perceive(&unit.perception));
             // The first is the unit itself.
             views.extend(perceived.into_iter().skip(1));
@@ -285,6 +294,10 @@ impl StationTurn<'_> {
                 tick.obstacles,
                 tick.random,
             );
+            let observer = Observer {
+                radio: Some(ObservingRadio::new(self.number, tick)),
+                ..observer
+            };
             self.generate_cpm(tick, &composer, &observer, tick.perception);
         }
     }

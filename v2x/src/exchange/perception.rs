@@ -5,7 +5,10 @@ use sim_core::scene::shape::{Bounds, Point};
 
 use super::outgoing::StationTick;
 use crate::{
-    radio::obstruction::{Antenna, Obstacles},
+    radio::{
+        obstruction::{Antenna, Obstacles},
+        open_strips::{OpenStrips, SharedStrip},
+    },
     random::{LinkKey, RadioDraw, RadioRandom},
     roadside::RoadsideUnit,
     services::turn,
@@ -32,6 +35,37 @@ pub struct Observer<'a> {
     pub obstacles: &'a Obstacles,
     /// Random numbers of the episode.
     pub random: &'a RadioRandom,
+    /// Its radio, where the strips of radios are known: what is in one strip with it is found sooner.
+    pub radio: Option<ObservingRadio<'a>>,
+}
+
+/// A radio of an observer.
+#[derive(Clone, Copy)]
+pub struct ObservingRadio<'a> {
+    number: u32,
+    strips: &'a OpenStrips,
+    radio_of_row: &'a [u32],
+}
+
+impl<'a> ObservingRadio<'a> {
+    /// The radio of this number of a tick.
+    #[must_use]
+    pub fn new(number: u32, tick: &StationTick<'a>) -> Self {
+        Self {
+            number,
+            strips: tick.strips,
+            radio_of_row: tick.radio_of_row,
+        }
+    }
+
+    /// A strip that it shares with the radio of the road user at a row: both are at the middles of their road users.
+    fn shared(&self, row: u32) -> Option<SharedStrip> {
+        let other = *self.radio_of_row.get(row as usize)?;
+        match other {
+            u32::MAX => None,
+            other => self.strips.shared(self.number as usize, other as usize),
+        }
+    }
 }
 
 impl<'a> Observer<'a> {
@@ -56,12 +90,13 @@ impl<'a> Observer<'a> {
             states,
             obstacles,
             random,
+            radio: None,
         }
     }
 
-    /// A roadside unit of the tick.
+    /// A roadside unit of the tick, whose radio has a number.
     #[must_use]
-    pub fn of_roadside(unit: &'a RoadsideUnit, station: u32, tick: &StationTick<'a>) -> Self {
+    pub fn of_roadside(unit: &'a RoadsideUnit, radio: u32, station: u32, tick: &StationTick<'a>) -> Self {
         Self {
             antenna: &unit.antenna,
             centre_m: unit.antenna.position_m,
@@ -72,6 +107,24 @@ impl<'a> Observer<'a> {
             states: tick.states,
             obstacles: tick.obstacles,
             random: tick.random,
+            radio: Some(ObservingRadio::new(radio, tick)),
+        }
+    }
+
+    /// True if a building or another road user is in the way of a place.
+    fn is_hidden(&self, target: &Antenna) -> bool {
+        let obstacles = self.obstacles;
+        let shared = self
+            .radio
+            .and_then(|radio| Some((radio.strips, radio.shared(target.row)?)));
+        match shared {
+            Some((strips, shared)) => strips
+                .highest_vehicle_m(&shared, obstacles, self.antenna, target)
+                .is_some(),
+            None => {
+                obstacles.meets_building(self.antenna, target)
+                    || obstacles.highest_vehicle_m(self.antenna, target).is_some()
+            }
         }
     }
 
@@ -98,9 +151,7 @@ impl<'a> Observer<'a> {
                 z_m: body.z_m[1],
                 row: *row,
             };
-            let hidden = obstacles.meets_building(self.antenna, &target)
-                || obstacles.highest_vehicle_m(self.antenna, &target).is_some();
-            if hidden {
+            if self.is_hidden(&target) {
                 return None;
             }
             let key = LinkKey {

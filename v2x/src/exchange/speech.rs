@@ -13,9 +13,9 @@ use ipc_schema::{
 use serde::{Deserialize, Serialize};
 use sim_core::scene::shape::{Bounds, Point};
 
-use super::{ExchangeMap, HeardMessage, MessageExchange, SlotMeasurement, perception::Observer, size_of};
+use super::{ExchangeMap, MessageExchange, SlotMeasurement, perception::Observer, size_of};
 use crate::{
-    local_map::{HeardObjects, KnownObject},
+    local_map::{HeardMessage, HeardObjects, KnownObject},
     parallel,
     radio::obstruction::Antenna,
     services::{MeasuredMotion, turn},
@@ -97,6 +97,8 @@ struct SpeechTick<'a> {
     map: &'a ExchangeMap,
     objects: &'a HeardObjects,
     heard: &'a [HeardMessage],
+    /// Slots of their senders.
+    senders: &'a [usize],
 }
 
 impl MessageExchange {
@@ -182,7 +184,7 @@ impl MessageExchange {
             for row in &of_slot.lacks {
                 let speakers = seen_by.get(row).into_iter().flatten().filter(|(speaker, _)| {
                     let name = self.stations[*speaker].as_ref().map_or(0, |speaker| speaker.station);
-                    *speaker != slot && station.map.has_heard(name)
+                    *speaker != slot && station.map.has_heard(&self.objects, name)
                 });
                 let away2 =
                     |speaker: usize| place_of(speaker).map_or(f64::INFINITY, |there_m| distance2(here_m, there_m));
@@ -262,6 +264,7 @@ impl MessageExchange {
             map: &self.maps[self.at],
             objects: &self.objects,
             heard: &self.heard,
+            senders: &self.senders,
         }
     }
 }
@@ -281,13 +284,13 @@ impl SpeechTick<'_> {
             }
         }
         for message in inbox {
-            let HeardMessage { sender, objects } = &self.heard[*message as usize];
-            for view in self.objects.of(objects.clone()) {
+            let (message, sender) = (&self.heard[*message as usize], self.senders[*message as usize]);
+            for view in self.objects.of(message.objects.clone()) {
                 let Some((user, until_ms)) = self.of(view, &mut in_range) else {
                     continue;
                 };
                 match view.source {
-                    NeighbourSource::Cpm => user.extended.push((*sender, until_ms)),
+                    NeighbourSource::Cpm => user.extended.push((sender, until_ms)),
                     // Its own word comes anyway: what others say at the same time adds nothing to it.
                     _ => user.until_ms = user.until_ms.max(until_ms),
                 }

@@ -20,15 +20,76 @@ use crate::{
     random::{LinkKey, RadioDraw, RadioRandom},
 };
 
-/// A message as one receiver hears it.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct HeardSignal {
-    /// Place of its transmission in the schedule.
-    number: u32,
-    /// Mean power at the receiver, milliwatts.
-    power_mw: f32,
-    /// Twice the shape of its fading; 0 = none.
-    twice_shape: u32,
+/// A message on air as its receivers need it.
+#[derive(Debug, Clone, Copy)]
+struct SentMessage {
+    start_ns: u64,
+    end_ns: u64,
+    station: u32,
+    message: u32,
+    bytes: u32,
+}
+
+impl SentMessage {
+    /// Time during which another one is on air too, nanoseconds.
+    fn overlap_ns(&self, other: &Self) -> u64 {
+        let (from, to) = (self.start_ns.max(other.start_ns), self.end_ns.min(other.end_ns));
+        to.saturating_sub(from)
+    }
+
+    /// Share of its time on air of a time within it, at most 1.
+    fn share_of(&self, time_ns: u64) -> f64 {
+        (time_ns as f64 / (self.end_ns - self.start_ns) as f64).min(1.0)
+    }
+}
+
+/// What a thread uses for one receiver after the other.
+#[derive(Default)]
+struct ReceptionRoom {
+    /// A bit for each transmission that the receiver hears.
+    heard: Vec<u64>,
+    /// By transmission: the place of its link in the receiver's row.
+    link: Vec<u32>,
+    signals: HeardSignals,
+}
+
+/// The messages of others at one receiver by their beginning, a column for each number, with a whole number of batches.
+#[derive(Debug, Default)]
+struct HeardSignals {
+    /// How many they are.
+    count: usize,
+    /// Places of the transmissions in the schedule.
+    numbers: Vec<u32>,
+    /// Stations that sent them, numbers of the messages, and their bits.
+    senders: Vec<u32>,
+    messages: Vec<u32>,
+    bits: Vec<f32>,
+    /// Mean powers at the receiver, milliwatts, and twice the shapes of their fading; 0 = none.
+    powers_mw: Vec<f32>,
+    shapes: Vec<u32>,
+    estimates: Vec<SignalEstimate>,
+    /// By batch: a bit for each signal that may be decoded.
+    open: Vec<u32>,
+}
+
+impl HeardSignals {
+    /// Makes room for so many.
+    fn resize(&mut self, count: usize) {
+        let padded = count.next_multiple_of(BATCH);
+        self.count = count;
+        for column in [
+            &mut self.numbers,
+            &mut self.senders,
+            &mut self.messages,
+            &mut self.shapes,
+        ] {
+            column.resize(padded, 0);
+        }
+        self.bits.resize(padded, 0.0);
+        self.powers_mw.resize(padded, 0.0);
+        self.estimates.resize(padded, SignalEstimate::default());
+        self.open.resize(padded / BATCH, 0);
+    }
 }
 
 /// Items of each radio, in the order in which they came.
@@ -65,6 +126,8 @@ impl<T: Copy + Default> ByRadio<T> {
 pub struct DecodingTable {
     /// Logarithm of the probability that a bit is decoded.
     log_success: Vec<f32>,
+    /// Upper bounds of it for all ratios, by [`step_above`].
+    upper: Box<[f32; UPPER_STEPS]>,
 }
 
 /// Steps of the table per unit of the ratio.
@@ -74,10 +137,24 @@ impl Default for DecodingTable {
     fn default() -> Self {
         let count = ((CERTAIN as f32 - 1.0) * STEPS) as usize + 3;
         let ratio = |step: usize| 1.0 + step as f64 / f64::from(STEPS);
-        Self {
-            log_success: (0..count).map(|step| log_bit_success(ratio(step)) as f32).collect(),
-        }
+        let log_success: Vec<f32> = (0..count).map(|step| log_bit_success(ratio(step)) as f32).collect();
+        let certain = ((CERTAIN as f32 - 1.0) * STEPS) as usize - 4;
+        let mut upper = Box::new([0.0; UPPER_STEPS]);
+        upper[..certain].copy_from_slice(&log_success[..certain]);
+        Self { log_success, upper }
     }
+}
+
+/// Steps that the table of upper bounds has, more than enough for [`CERTAIN`].
+const UPPER_STEPS: usize = 4096;
+
+/// Place in the table of upper bounds for a ratio: that of a ratio that is not lower.
+#[inline(always)]
+fn step_above(ratio: f32) -> u32 {
+    // Adding it leaves the nearest whole number in the low bits.
+    const WHOLE: f32 = 8_388_608.0;
+    let step = ((ratio - 1.0) * STEPS).clamp(0.0, (UPPER_STEPS - 2) as f32);
+    ((step + WHOLE).to_bits() & 0x007F_FFFF) + 1
 }
 
 impl DecodingTable {
@@ -105,15 +182,13 @@ const LOG_ERROR: f32 = 1e-4;
 /// Signals that are evaluated at once.
 const BATCH: usize = 16;
 
-/// A batch of receptions: keys and shapes in; gains of fading, and logarithms of the numbers that decide on decoding, out.
-struct FadingBatch<'a> {
+/// Draws the fading of all signals at a receiver, and finds those that may be decoded without a disturbance.
+struct FadedSignals<'a> {
     key: [u32; 2],
     receiver: u32,
-    senders: &'a [u32; BATCH],
-    messages: &'a [u32; BATCH],
-    shapes: &'a [u32; BATCH],
-    gains: &'a mut [f32; BATCH],
-    log_draws: &'a mut [f32; BATCH],
+    noise_mw: f32,
+    table: &'a DecodingTable,
+    signals: &'a mut HeardSignals,
 }
 
 /// Natural logarithm of a word as a number uniform in (0, 1).
@@ -124,156 +199,244 @@ fn log_uniform(word: u32) -> f32 {
     -0.5 * minus_two_ln(number)
 }
 
-impl VectorWork for FadingBatch<'_> {
+/// One batch: gains of fading, and logarithms of the numbers that decide on decoding.
+#[inline(always)]
+fn fade_batch(
+    key: [u32; 2],
+    receiver: u32,
+    [senders, messages, shapes]: [&[u32; BATCH]; 3],
+    gains: &mut [f32; BATCH],
+    log_draws: &mut [f32; BATCH],
+) {
+    let mut words = [[0_u32; BATCH]; 4];
+    for (lane, sender) in senders.iter().enumerate() {
+        let counter = RadioRandom::counter(
+            LinkKey {
+                sender: *sender,
+                receiver,
+                message: messages[lane],
+            },
+            RadioDraw::Reception,
+            0,
+        );
+        let drawn = philox4x32(counter, key);
+        for (word, lanes) in words.iter_mut().enumerate() {
+            lanes[lane] = drawn[word];
+        }
+    }
+    for (lane, gain_of) in gains.iter_mut().enumerate() {
+        let (a, b, c) = (
+            log_uniform(words[0][lane]),
+            log_uniform(words[1][lane]),
+            log_uniform(words[2][lane]),
+        );
+        let (cos, _) = cos_sin(words[2][lane]);
+        let shape = shapes[lane];
+        let three = (a + b + c) * (-1.0 / 3.0);
+        let half = (a + b * cos * cos) * (-2.0 / 3.0);
+        let gain = if shape == 6 { three } else { -a };
+        let gain = if shape == 3 { half } else { gain };
+        *gain_of = if shape == 0 { 1.0 } else { gain };
+        log_draws[lane] = log_uniform(words[3][lane]);
+    }
+}
+
+impl VectorWork for FadedSignals<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run(self) {
-        let mut words = [[0_u32; BATCH]; 4];
-        for (lane, sender) in self.senders.iter().enumerate() {
-            let counter = RadioRandom::counter(
-                LinkKey {
-                    sender: *sender,
-                    receiver: self.receiver,
-                    message: self.messages[lane],
-                },
-                RadioDraw::Reception,
-                0,
-            );
-            let drawn = philox4x32(counter, self.key);
-            for (word, lanes) in words.iter_mut().enumerate() {
-                lanes[lane] = drawn[word];
+        let HeardSignals {
+            senders,
+            messages,
+            bits,
+            powers_mw,
+            shapes,
+            estimates,
+            open,
+            ..
+        } = self.signals;
+        let (senders, messages) = (senders.as_chunks::<BATCH>().0, messages.as_chunks::<BATCH>().0);
+        let (shapes, powers_mw) = (shapes.as_chunks::<BATCH>().0, powers_mw.as_chunks::<BATCH>().0);
+        let (bits, estimates) = (bits.as_chunks::<BATCH>().0, estimates.as_chunks_mut::<BATCH>().0);
+        for batch in 0..senders.len() {
+            let (mut gains, mut log_draws) = ([0.0; BATCH], [0.0; BATCH]);
+            let keys = [&senders[batch], &messages[batch], &shapes[batch]];
+            fade_batch(self.key, self.receiver, keys, &mut gains, &mut log_draws);
+            let (mut ratios, mut errors, mut steps) = ([0.0; BATCH], [0.0; BATCH], [0; BATCH]);
+            for lane in 0..BATCH {
+                let mean_ratio = powers_mw[batch][lane] / self.noise_mw;
+                ratios[lane] = mean_ratio * gains[lane];
+                errors[lane] = mean_ratio * GAIN_ERROR + 1e-6;
+                steps[lane] = step_above((ratios[lane] + errors[lane]) * (1.0 + 1e-5));
             }
-        }
-        for (lane, gain_of) in self.gains.iter_mut().enumerate() {
-            let (a, b, c) = (
-                log_uniform(words[0][lane]),
-                log_uniform(words[1][lane]),
-                log_uniform(words[2][lane]),
-            );
-            let (cos, _) = cos_sin(words[2][lane]);
-            let shape = self.shapes[lane];
-            let three = (a + b + c) * (-1.0 / 3.0);
-            let half = (a + b * cos * cos) * (-2.0 / 3.0);
-            let gain = if shape == 6 { three } else { -a };
-            let gain = if shape == 3 { half } else { gain };
-            *gain_of = if shape == 0 { 1.0 } else { gain };
-            self.log_draws[lane] = log_uniform(words[3][lane]);
+            let mut may_be = 0;
+            for lane in 0..BATCH {
+                let upper = self.table.upper[steps[lane] as usize % UPPER_STEPS];
+                may_be |= u32::from(log_draws[lane] <= bits[batch][lane] * upper + LOG_ERROR) << lane;
+            }
+            open[batch] = may_be;
+            for lane in 0..BATCH {
+                estimates[batch][lane] = SignalEstimate {
+                    ratio: ratios[lane],
+                    error: errors[lane],
+                    log_draw: log_draws[lane],
+                };
+            }
         }
     }
 }
 
-/// Who hears what in a tick.
+/// What each radio hears in a tick.
 pub struct Receptions<'a> {
     medium: &'a Medium,
     table: &'a DecodingTable,
     on_air: OnAir<'a>,
     random: &'a RadioRandom,
     path: VectorPath,
-    /// By receiver: the signals of others, by their beginning.
-    heard: ByRadio<HeardSignal>,
+    /// By transmission.
+    messages: Vec<SentMessage>,
     /// By radio: what it sends itself.
     sent: ByRadio<u32>,
 }
 
 impl<'a> Receptions<'a> {
-    /// Finds what each of the radios hears.
+    /// Takes what is on air.
     #[must_use]
     pub fn new(medium: &'a Medium, table: &'a DecodingTable, on_air: OnAir<'a>, random: &'a RadioRandom) -> Self {
-        let OnAir {
-            schedule,
-            queue,
-            links,
-            stations,
-        } = on_air;
+        let OnAir { schedule, queue, .. } = on_air;
+        let message = |sent: &Transmission| {
+            let QueuedMessage {
+                station,
+                message,
+                bytes,
+                ..
+            } = queue[sent.queued];
+            SentMessage {
+                start_ns: sent.start_ns,
+                end_ns: sent.end_ns,
+                station,
+                message,
+                bytes,
+            }
+        };
         let senders = schedule.on_air.iter().map(|sent| queue[sent.queued].radio);
         let numbered = (0_u32..).zip(senders);
-        let signals = numbered.clone().flat_map(|(number, sender)| {
-            links[sender as usize].iter().map(move |link| {
-                let signal = HeardSignal {
-                    number,
-                    power_mw: link.power_mw,
-                    twice_shape: link.twice_shape,
-                };
-                (link.radio, signal)
-            })
-        });
-        let heard = ByRadio::new(stations.len(), signals);
-        let sent = ByRadio::new(stations.len(), numbered.map(|(number, sender)| (sender, number)));
         Self {
             medium,
             table,
             on_air,
             random,
             path: VectorPath::widest(),
-            heard,
-            sent,
+            messages: schedule.on_air.iter().map(message).collect(),
+            sent: ByRadio::new(on_air.stations.len(), numbered.map(|(number, sender)| (sender, number))),
         }
     }
 
-    /// By radio: places of the transmissions that it decodes, ascending.
-    #[must_use]
-    pub fn decoded(&self, threads: usize) -> Vec<Vec<u32>> {
-        let mut decoded = vec![Vec::new(); self.on_air.stations.len()];
-        parallel::for_each(threads, &mut decoded, |radio, decoded| self.decode(radio, decoded));
-        decoded
+    /// By radio: places of the transmissions that it decodes, ascending, into `decoded`.
+    pub fn decode(&self, threads: usize, decoded: &mut [Vec<u32>]) {
+        parallel::for_each_with(threads, decoded, ReceptionRoom::default, |room, radio, decoded| {
+            self.hear(radio, room);
+            decoded.clear();
+            self.decode_at(radio, &room.signals, decoded);
+        });
     }
 
-    fn transmission(&self, number: u32) -> &Transmission {
-        &self.on_air.schedule.on_air[number as usize]
-    }
-
-    fn message(&self, number: u32) -> &QueuedMessage {
-        &self.on_air.queue[self.transmission(number).queued]
+    /// Finds the signals of others at a radio, and draws their fading.
+    fn hear(&self, radio: usize, room: &mut ReceptionRoom) {
+        let ReceptionRoom {
+            heard,
+            link: link_of,
+            signals,
+        } = room;
+        let links = self.on_air.links.of(radio as u32);
+        // A bit for each transmission is cheaper than sorting.
+        heard.clear();
+        heard.resize(self.messages.len().div_ceil(64), 0);
+        link_of.resize(self.messages.len(), 0);
+        for (place, link) in (0_u32..).zip(links) {
+            for number in self.sent.of(link.radio as usize).iter().map(|number| *number as usize) {
+                heard[number / 64] |= 1 << (number % 64);
+                link_of[number] = place;
+            }
+        }
+        signals.resize(heard.iter().map(|word| word.count_ones() as usize).sum());
+        let mut signal = 0;
+        for (place, mut word) in (0_u32..).zip(heard.iter().copied()) {
+            while word != 0 {
+                let number = 64 * place + word.trailing_zeros();
+                word &= word - 1;
+                let link = &links[link_of[number as usize] as usize];
+                let sent = &self.messages[number as usize];
+                signals.numbers[signal] = number;
+                signals.senders[signal] = sent.station;
+                signals.messages[signal] = sent.message;
+                signals.bits[signal] = 8.0 * sent.bytes as f32;
+                signals.powers_mw[signal] = link.power_mw;
+                signals.shapes[signal] = link.twice_shape;
+                signal += 1;
+            }
+        }
+        self.path.run(FadedSignals {
+            key: self.random.key(),
+            receiver: self.on_air.stations[radio],
+            noise_mw: self.medium.noise_mw as f32,
+            table: self.table,
+            signals,
+        });
     }
 
     /// What one radio decodes.
-    fn decode(&self, radio: usize, decoded: &mut Vec<u32>) {
-        let (signals, station) = (self.heard.of(radio), self.on_air.stations[radio]);
-        let estimates = self.estimates(signals, station);
-        for (place, (signal, estimate)) in signals.iter().zip(&estimates).enumerate() {
+    fn decode_at(&self, radio: usize, signals: &HeardSignals, decoded: &mut Vec<u32>) {
+        for (batch, mut open) in signals.open.iter().copied().enumerate() {
             // Most links are too weak even without a disturbance.
-            let bits = 8.0 * self.message(signal.number).bytes as f32;
-            let [_, upper] = self.table.bounds(estimate.ratio_range([0.0; 2]));
-            if estimate.log_draw > bits * upper + LOG_ERROR {
-                continue;
-            }
-            // A radio cannot hear while it sends.
-            let sent = self.transmission(signal.number);
-            let mut own = self.sent.of(radio).iter().map(|number| self.transmission(*number));
-            if own.any(|own| sent.overlap_ns(own) > 0) {
-                continue;
-            }
-            let around = self.around(signals, place);
-            let [lower, upper] = self.log_probability(signals, &estimates, place, around.clone());
-            let is_decoded = if estimate.log_draw < lower - LOG_ERROR {
-                true
-            } else if estimate.log_draw > upper + LOG_ERROR {
-                false
-            } else {
-                self.decodes(signals, place, around, station)
-            };
-            if is_decoded {
-                decoded.push(signal.number);
+            while open != 0 {
+                let place = batch * BATCH + open.trailing_zeros() as usize;
+                open &= open - 1;
+                if place < signals.count && self.is_decoded(radio, signals, place) {
+                    decoded.push(signals.numbers[place]);
+                }
             }
         }
     }
 
+    fn is_decoded(&self, radio: usize, signals: &HeardSignals, place: usize) -> bool {
+        let estimate = &signals.estimates[place];
+        // A radio cannot hear while it sends.
+        let sent = self.sent_at(signals, place);
+        let mut own = self
+            .sent
+            .of(radio)
+            .iter()
+            .map(|number| &self.messages[*number as usize]);
+        if own.any(|own| sent.overlap_ns(own) > 0) {
+            return false;
+        }
+        let around = self.around(signals, place);
+        let [lower, upper] = self.log_probability(signals, place, around.clone());
+        if estimate.log_draw < lower - LOG_ERROR {
+            true
+        } else if estimate.log_draw > upper + LOG_ERROR {
+            false
+        } else {
+            self.decodes(signals, place, around, self.on_air.stations[radio])
+        }
+    }
+
+    /// The message of a signal.
+    fn sent_at(&self, signals: &HeardSignals, place: usize) -> &SentMessage {
+        &self.messages[signals.numbers[place] as usize]
+    }
+
     /// Bounds of the logarithm of the probability that a signal is decoded, with what disturbs it.
-    fn log_probability(
-        &self,
-        signals: &[HeardSignal],
-        estimates: &[SignalEstimate],
-        place: usize,
-        around: Range<usize>,
-    ) -> [f32; 2] {
-        let (sent, estimate) = (self.transmission(signals[place].number), &estimates[place]);
-        let bytes = self.message(signals[place].number).bytes as usize;
+    fn log_probability(&self, signals: &HeardSignals, place: usize, around: Range<usize>) -> [f32; 2] {
+        let (sent, estimate) = (self.sent_at(signals, place), &signals.estimates[place]);
+        let bytes = sent.bytes as usize;
         let (mut disturbance, mut disturbed_ns) = ([0.0; 2], 0);
         for other in around.filter(|other| *other != place) {
-            let overlap_ns = sent.overlap_ns(self.transmission(signals[other].number));
+            let overlap_ns = sent.overlap_ns(self.sent_at(signals, other));
             if overlap_ns > 0 {
-                let [low, high] = estimates[other].ratio_range([0.0; 2]);
+                let [low, high] = signals.estimates[other].ratio_range([0.0; 2]);
                 disturbance = [disturbance[0] + low, disturbance[1] + high];
                 disturbed_ns += overlap_ns;
             }
@@ -289,56 +452,23 @@ impl<'a> Receptions<'a> {
     }
 
     /// Places of the signals that may overlap with one of them, itself too.
-    fn around(&self, signals: &[HeardSignal], place: usize) -> Range<usize> {
-        let sent = self.transmission(signals[place].number);
+    fn around(&self, signals: &HeardSignals, place: usize) -> Range<usize> {
+        let sent = self.sent_at(signals, place);
         let longest_ns = self.on_air.schedule.longest_ns;
-        let start_ns = |place: usize| self.transmission(signals[place].number).start_ns;
+        let start_ns = |place: usize| self.sent_at(signals, place).start_ns;
         let (mut from, mut to) = (place, place + 1);
         while from > 0 && start_ns(from - 1) + longest_ns > sent.start_ns {
             from -= 1;
         }
-        while to < signals.len() && start_ns(to) < sent.end_ns {
+        while to < signals.count && start_ns(to) < sent.end_ns {
             to += 1;
         }
         from..to
     }
 
-    fn estimates(&self, signals: &[HeardSignal], station: u32) -> Vec<SignalEstimate> {
-        let mut estimates = Vec::with_capacity(signals.len());
-        let noise_mw = self.medium.noise_mw as f32;
-        for batch in signals.chunks(BATCH) {
-            let [mut senders, mut messages, mut shapes] = [[0; BATCH]; 3];
-            for (lane, signal) in batch.iter().enumerate() {
-                let message = self.message(signal.number);
-                (senders[lane], messages[lane], shapes[lane]) = (message.station, message.message, signal.twice_shape);
-            }
-            let (mut gains, mut log_draws) = ([0.0; BATCH], [0.0; BATCH]);
-            self.path.run(FadingBatch {
-                key: self.random.key(),
-                receiver: station,
-                senders: &senders,
-                messages: &messages,
-                shapes: &shapes,
-                gains: &mut gains,
-                log_draws: &mut log_draws,
-            });
-            for (lane, signal) in batch.iter().enumerate() {
-                let mean_ratio = signal.power_mw / noise_mw;
-                estimates.push(SignalEstimate {
-                    ratio: mean_ratio * gains[lane],
-                    error: mean_ratio * GAIN_ERROR + 1e-6,
-                    log_draw: log_draws[lane],
-                });
-            }
-        }
-        estimates
-    }
-
     /// The same by the formulas.
-    fn decodes(&self, signals: &[HeardSignal], place: usize, around: Range<usize>, station: u32) -> bool {
-        let signal = &signals[place];
-        let message = self.message(signal.number);
-        let draws = |message: &QueuedMessage| {
+    fn decodes(&self, signals: &HeardSignals, place: usize, around: Range<usize>, station: u32) -> bool {
+        let draws = |message: &SentMessage| {
             let key = LinkKey {
                 sender: message.station,
                 receiver: station,
@@ -346,18 +476,20 @@ impl<'a> Receptions<'a> {
             };
             self.random.uniforms(key, RadioDraw::Reception, 0)
         };
-        let drawn = draws(message);
-        let bytes = message.bytes as usize;
-        let signal_mw = faded_mw(signal.power_mw, signal.twice_shape, drawn);
+        let power_mw = |place: usize, draws: [f64; 4]| faded_mw(signals.powers_mw[place], signals.shapes[place], draws);
+        let sent = self.sent_at(signals, place);
+        let drawn = draws(sent);
+        let bytes = sent.bytes as usize;
+        let signal_mw = power_mw(place, drawn);
         if drawn[3] >= decode_probability(signal_mw / self.medium.noise_mw, bytes) {
             return false;
         }
-        let sent = self.transmission(signal.number);
         let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
-        for other in around.filter(|other| *other != place).map(|other| &signals[other]) {
-            let overlap_ns = sent.overlap_ns(self.transmission(other.number));
+        for other in around.filter(|other| *other != place) {
+            let disturbing = self.sent_at(signals, other);
+            let overlap_ns = sent.overlap_ns(disturbing);
             if overlap_ns > 0 {
-                disturbance_mw += faded_mw(other.power_mw, other.twice_shape, draws(self.message(other.number)));
+                disturbance_mw += power_mw(other, draws(disturbing));
                 disturbed_ns += overlap_ns;
             }
         }
@@ -367,7 +499,7 @@ impl<'a> Receptions<'a> {
 }
 
 /// A reception by its numbers in f32.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct SignalEstimate {
     /// Faded power over the noise.
     ratio: f32,

@@ -6,7 +6,7 @@ use sim_core::scene::{Grid, shape::Bounds};
 
 use super::{
     link_power::{LinkPowers, LinkTerms},
-    medium::{Medium, MediumLink},
+    medium::{Medium, MediumLink, RadioLinks},
     milliwatts,
     obstruction::{Antenna, LinkObstruction, Obstacles},
     open_strips::OpenStrips,
@@ -45,22 +45,20 @@ struct RadioShadows {
 }
 
 impl RadioShadows {
-    fn new(field: &ShadowingField, config: &V2xConfig, radios: &[Radio]) -> Self {
-        let ends = |state, end: usize| {
+    fn fill(&mut self, field: &ShadowingField, config: &V2xConfig, radios: &[Radio]) {
+        let Self { clear, obstructed } = self;
+        for (state, ends) in [(LinkState::Clear, clear), (LinkState::Building, obstructed)] {
             let decorrelation = decorrelation_m(config.path_loss, state);
-            let mut ends = vec![ShadowingEnd::default(); radios.len()];
-            parallel::for_each(config.threads as usize, &mut ends, |radio, at| {
-                let position_m = radios[radio].antenna.position_m;
-                *at = match end {
-                    0 => field.first_end(position_m, decorrelation),
-                    _ => field.second_end(position_m, decorrelation),
-                };
-            });
-            ends
-        };
-        Self {
-            clear: [ends(LinkState::Clear, 0), ends(LinkState::Clear, 1)],
-            obstructed: [ends(LinkState::Building, 0), ends(LinkState::Building, 1)],
+            for (end, ends) in ends.iter_mut().enumerate() {
+                ends.resize_with(radios.len(), ShadowingEnd::default);
+                parallel::for_each(config.threads as usize, ends, |radio, at| {
+                    let position_m = radios[radio].antenna.position_m;
+                    *at = match end {
+                        0 => field.first_end(position_m, decorrelation),
+                        _ => field.second_end(position_m, decorrelation),
+                    };
+                });
+            }
         }
     }
 }
@@ -106,7 +104,9 @@ struct PairRoom {
     pairs: Vec<RadioPair>,
     /// Of `pairs`.
     terms: LinkTerms,
-    witnesses: Vec<Witness>,
+    /// Of pairs of which none sends.
+    kept: Vec<Witness>,
+    found: Vec<Witness>,
 }
 
 /// Computes the links of an episode, tick by tick.
@@ -116,11 +116,14 @@ pub struct LinkComputer {
     field: ShadowingField,
     /// Power below which a link does not count, dBm.
     least_dbm: f64,
-    /// By state of the link: path loss at 1 m, and for each decade of distance, dB.
-    losses_db: [[f64; 2]; 3],
+    /// By state of the link: power less the loss at 1 m, dBm; loss for each decade of distance, and standard deviation of shadowing, dB.
+    terms_of_states: [[f64; 3]; 3],
     path: VectorPath,
     /// By slot, ascending by the later slot.
     witnesses: Vec<Vec<Witness>>,
+    /// By radio: links to those after it. Kept for its memory.
+    to_later: Vec<Vec<MediumLink>>,
+    shadows: RadioShadows,
     strips: OpenStrips,
 }
 
@@ -152,39 +155,55 @@ impl LinkComputer {
             random,
             field: ShadowingField::new(&random),
             least_dbm: medium.irrelevant_dbm(),
-            losses_db: [LinkState::Clear, LinkState::Vehicles, LinkState::Building].map(|state| {
-                let [near, far] = [1.0, 10.0].map(|distance_m| path_loss_db(config.path_loss, state, distance_m));
-                [near, far - near]
+            terms_of_states: [0, 1, 2].map(|term: usize| {
+                [LinkState::Clear, LinkState::Vehicles, LinkState::Building].map(|state| {
+                    let [near, far] = [1.0, 10.0].map(|distance_m| path_loss_db(config.path_loss, state, distance_m));
+                    let shadowing_db = if config.fading { shadowing_std_db(state) } else { 0.0 };
+                    [config.power_dbm - near, far - near, shadowing_db][term]
+                })
             }),
             path: VectorPath::widest(),
             witnesses: Vec::new(),
+            to_later: Vec::new(),
+            shadows: RadioShadows::default(),
             strips: OpenStrips::default(),
         }
     }
 
-    /// Links of every radio that sends, ascending by receiver; none of the others.
-    pub fn links(&mut self, tick: RadioTick) -> Vec<Vec<MediumLink>> {
-        let RadioTick { radios, sends, .. } = tick;
+    /// Finds the strips that the radios of a tick are in.
+    pub fn enter(&mut self, obstacles: &Obstacles, radios: &[Radio]) {
+        self.strips.enter(obstacles, radios);
+    }
+
+    /// The strips of the radios that [`LinkComputer::enter`] took last.
+    #[must_use]
+    pub fn strips(&self) -> &OpenStrips {
+        &self.strips
+    }
+
+    /// The links of a tick of which one radio sends, into `links`. Call it after [`LinkComputer::enter`].
+    pub fn links(&mut self, tick: RadioTick, links: &mut RadioLinks) {
+        let radios = tick.radios;
         let most = radios.last().map_or(0, |radio| radio.slot + 1);
         self.witnesses.resize_with(self.witnesses.len().max(most), Vec::new);
+        self.to_later.resize_with(radios.len(), Vec::new);
         let mut turns: Vec<PairTurn> = radios
             .iter()
-            .map(|radio| PairTurn {
-                links: Vec::new(),
+            .zip(&mut self.to_later)
+            .map(|(radio, links)| PairTurn {
+                links: std::mem::take(links),
                 witnesses: std::mem::take(&mut self.witnesses[radio.slot]),
                 apart: None,
             })
             .collect();
-        let shadows = match self.config.fading {
-            true => RadioShadows::new(&self.field, &self.config, radios),
-            false => RadioShadows::default(),
-        };
+        if self.config.fading {
+            self.shadows.fill(&self.field, &self.config, radios);
+        }
         let bounds: Vec<Bounds> = radios
             .iter()
             .map(|radio| Bounds::about(radio.antenna.position_m, 0.0))
             .collect();
         let index = Grid::new(&bounds, 0.25 * self.config.range_m);
-        self.strips.enter(tick.obstacles, radios);
         let this = &*self;
         let threads = this.config.threads as usize;
         parallel::for_each_with(threads, &mut turns, PairRoom::default, |room, first, turn| {
@@ -192,7 +211,7 @@ impl LinkComputer {
             this.obstruct(&tick, first, turn, room);
             if this.config.fading {
                 this.path.run(ShadowedPairs {
-                    shadows: &shadows,
+                    shadows: &this.shadows,
                     first,
                     pairs: &room.pairs,
                     normals: &mut room.terms.normal,
@@ -207,23 +226,11 @@ impl LinkComputer {
             turn.apart.map(|(_, second)| [place(first), place(second as usize)])
         });
         self.strips.grow(tick.obstacles, apart);
-        // By radio: first those before it, then those after it.
-        let mut links: Vec<Vec<MediumLink>> = vec![Vec::new(); radios.len()];
-        for (first, turn) in turns.into_iter().enumerate() {
-            for link in &turn.links {
-                if sends[link.radio as usize] {
-                    links[link.radio as usize].push(MediumLink {
-                        radio: first as u32,
-                        ..*link
-                    });
-                }
-            }
-            if sends[first] {
-                links[first].extend(turn.links);
-            }
-            self.witnesses[radios[first].slot] = turn.witnesses;
+        for ((turn, links), radio) in turns.into_iter().zip(&mut self.to_later).zip(radios) {
+            *links = turn.links;
+            self.witnesses[radio.slot] = turn.witnesses;
         }
-        links
+        links.fill(&self.to_later);
     }
 
     /// Pairs of the radio `first` with those after it that are in range and of which one sends, ascending.
@@ -239,7 +246,7 @@ impl LinkComputer {
         });
         room.pairs.clear();
         room.terms.clear();
-        room.witnesses.clear();
+        room.kept.clear();
         let mut before = turn.witnesses.iter().peekable();
         for (place, mut word) in room.near.iter().copied().enumerate() {
             while word != 0 {
@@ -249,7 +256,7 @@ impl LinkComputer {
                 if !sends && !tick.sends[second] {
                     // What is known of it is kept.
                     while before.next_if(|witness| (witness.slot as usize) < b.slot).is_some() {}
-                    room.witnesses
+                    room.kept
                         .extend(before.next_if(|witness| witness.slot as usize == b.slot));
                     continue;
                 }
@@ -274,12 +281,19 @@ impl LinkComputer {
     fn obstruct(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &mut PairRoom) {
         let a = &tick.radios[first].antenna;
         let mut before = turn.witnesses.iter().peekable();
-        let mut kept = room.witnesses.iter().peekable();
-        let mut witnesses = Vec::with_capacity(turn.witnesses.len() + 16);
-        for (pair, flat2_m2) in room.pairs.iter_mut().zip(&room.terms.flat2_m2) {
+        let PairRoom {
+            pairs,
+            terms,
+            kept,
+            found,
+            ..
+        } = room;
+        let mut kept = kept.iter().peekable();
+        found.clear();
+        for (pair, flat2_m2) in pairs.iter_mut().zip(&terms.flat2_m2) {
             let Radio { slot, antenna: b, .. } = &tick.radios[pair.second as usize];
             while let Some(witness) = kept.next_if(|witness| (witness.slot as usize) < *slot) {
-                witnesses.push(*witness);
+                found.push(*witness);
             }
             while before.next_if(|witness| (witness.slot as usize) < *slot).is_some() {}
             if let Some(shared) = self.strips.shared(first, pair.second as usize) {
@@ -293,7 +307,7 @@ impl LinkComputer {
                 .or_else(|| tick.obstacles.wall_between(a, b));
             pair.between = match wall {
                 Some(wall) => {
-                    witnesses.push(Witness {
+                    found.push(Witness {
                         slot: *slot as u32,
                         wall,
                     });
@@ -310,25 +324,31 @@ impl LinkComputer {
                 }
             };
         }
-        witnesses.extend(kept);
-        turn.witnesses = witnesses;
+        found.extend(kept);
+        std::mem::swap(&mut turn.witnesses, found);
     }
 
     /// Makes links of the pairs that count.
     fn link(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &mut PairRoom) {
         let a = &tick.radios[first];
         let PairRoom { pairs, terms, .. } = room;
-        for pair in &*pairs {
-            let [at_1_m_db, decade_db] = self.losses_db[pair.between.state as usize];
-            let [vehicles_db, behind] = self.behind_vehicles(a, &tick.radios[pair.second as usize], pair.between);
-            terms.at_1_m_dbm.push(self.config.power_dbm - at_1_m_db);
-            terms.decade_db.push(decade_db);
-            terms.shadowing_db.push(match self.config.fading {
-                true => shadowing_std_db(pair.between.state),
-                false => 0.0,
-            });
-            terms.vehicles_db.push(vehicles_db);
-            terms.behind.push(behind);
+        turn.links.clear();
+        let state = |pair: &RadioPair| pair.between.state as usize;
+        let [at_1_m_dbm, decade_db, shadowing_db] = &self.terms_of_states;
+        terms
+            .at_1_m_dbm
+            .extend(pairs.iter().map(|pair| at_1_m_dbm[state(pair)]));
+        terms.decade_db.extend(pairs.iter().map(|pair| decade_db[state(pair)]));
+        terms
+            .shadowing_db
+            .extend(pairs.iter().map(|pair| shadowing_db[state(pair)]));
+        terms.vehicles_db.resize(pairs.len(), 0.0);
+        terms.behind.resize(pairs.len(), 0.0);
+        for (place, pair) in pairs.iter().enumerate() {
+            if pair.between.state == LinkState::Vehicles {
+                let b = &tick.radios[pair.second as usize];
+                [terms.vehicles_db[place], terms.behind[place]] = self.behind_vehicles(a, b, pair.between);
+            }
         }
         self.path.run(LinkPowers {
             terms,
@@ -364,9 +384,6 @@ impl LinkComputer {
 
     /// Loss of a link behind vehicles with its random part, without what distance adds, dB; and 1 if distance adds to it, else 0.
     fn behind_vehicles(&self, a: &Radio, b: &Radio, between: LinkObstruction) -> [f64; 2] {
-        if between.state != LinkState::Vehicles {
-            return [0.0; 2];
-        }
         let [mean_db, std_db] = vehicle_loss_db(between.above, 1.0);
         let behind = if std_db > 0.0 { 1.0 } else { 0.0 };
         [mean_db + std_db * self.blocking(a, b), behind]
@@ -502,11 +519,16 @@ mod tests {
                 sends: &sends,
                 obstacles: &obstacles,
             };
-            let found = alone.links(radio_tick);
-            assert_eq!(found, together.links(radio_tick));
-            for (sender, links) in found.iter().enumerate() {
+            let [mut found, mut same] = [RadioLinks::default(), RadioLinks::default()];
+            alone.enter(&obstacles, &radios);
+            together.enter(&obstacles, &radios);
+            alone.links(radio_tick, &mut found);
+            together.links(radio_tick, &mut same);
+            assert_eq!(found, same);
+            for sender in 0..radios.len() {
+                let links = found.of(sender as u32);
                 let expected: Vec<(u32, f64)> = (0..radios.len())
-                    .filter(|receiver| sends[sender] && *receiver != sender)
+                    .filter(|receiver| (sends[sender] || sends[*receiver]) && *receiver != sender)
                     .filter_map(|receiver| {
                         let (low, high) = (&radios[sender.min(receiver)], &radios[sender.max(receiver)]);
                         let state = obstacles.between(&low.antenna, &high.antenna).state;

@@ -48,6 +48,69 @@ pub struct MediumLink {
     pub twice_shape: u32,
 }
 
+/// The links of all radios of a tick, in rows. A link is the same in both directions, and stands in the rows of both of its radios.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RadioLinks {
+    /// First link of each radio, and one past the last of the last one.
+    starts: Vec<u32>,
+    /// Where the next link of each is written.
+    next: Vec<u32>,
+    links: Vec<MediumLink>,
+}
+
+impl RadioLinks {
+    /// Rows from the links of each radio to those after it, ascending.
+    #[must_use]
+    pub fn new(to_later: &[Vec<MediumLink>]) -> Self {
+        let mut links = Self::default();
+        links.fill(to_later);
+        links
+    }
+
+    /// The same in the memory of those before.
+    pub fn fill(&mut self, to_later: &[Vec<MediumLink>]) {
+        let Self { starts, next, links } = self;
+        starts.clear();
+        starts.resize(to_later.len() + 1, 0);
+        for (radio, later) in to_later.iter().enumerate() {
+            starts[radio + 1] += later.len() as u32;
+            for link in later {
+                starts[link.radio as usize + 1] += 1;
+            }
+        }
+        for radio in 0..to_later.len() {
+            starts[radio + 1] += starts[radio];
+        }
+        let none = MediumLink {
+            radio: 0,
+            power_mw: 0.0,
+            twice_shape: 0,
+        };
+        // Each is written below.
+        links.resize(starts[to_later.len()] as usize, none);
+        next.clone_from(starts);
+        // In a row come first those before it, then those after it.
+        for (radio, later) in to_later.iter().enumerate() {
+            let own = next[radio] as usize;
+            links[own..own + later.len()].copy_from_slice(later);
+            for link in later {
+                let place = &mut next[link.radio as usize];
+                links[*place as usize] = MediumLink {
+                    radio: radio as u32,
+                    ..*link
+                };
+                *place += 1;
+            }
+        }
+    }
+
+    /// Links of a radio, ascending by the other one: to all that it reaches if it sends, else to those of them that send.
+    #[must_use]
+    pub fn of(&self, radio: u32) -> &[MediumLink] {
+        &self.links[self.starts[radio as usize] as usize..self.starts[radio as usize + 1] as usize]
+    }
+}
+
 /// Power of one message on a link with this mean power, whose draws these are, milliwatts.
 pub(super) fn faded_mw(power_mw: f32, twice_shape: u32, draws: [f64; 4]) -> f64 {
     let gain = match twice_shape {
@@ -112,8 +175,8 @@ pub struct OnAir<'a> {
     pub schedule: &'a Schedule,
     /// The messages.
     pub queue: &'a [QueuedMessage],
-    /// Links of each radio, ascending by receiver.
-    pub links: &'a [Vec<MediumLink>],
+    /// Links of each radio.
+    pub links: &'a RadioLinks,
     /// Station id of each radio.
     pub stations: &'a [u32],
 }
@@ -148,9 +211,9 @@ impl Medium {
         dbm(self.noise_mw) - IRRELEVANT_DB
     }
 
-    /// When each message is sent. `links[radio]` are the links of each radio that has a message, ascending by receiver.
+    /// When each message is sent.
     #[must_use]
-    pub fn schedule(&self, queue: &[QueuedMessage], links: &[Vec<MediumLink>], random: &RadioRandom) -> Schedule {
+    pub fn schedule(&self, queue: &[QueuedMessage], links: &RadioLinks, random: &RadioRandom) -> Schedule {
         let mut schedule = Schedule {
             longest_ns: queue
                 .iter()
@@ -188,7 +251,7 @@ impl Medium {
                 is_recent
                     && (other.radio == message.radio
                         || has_begun
-                            && link_to(&links[other.radio as usize], message.radio)
+                            && link_to(links.of(other.radio), message.radio)
                                 .is_some_and(|link| f64::from(link.power_mw) >= self.busy_mw))
             };
             let busy_until_ns = schedule.on_air[heard_from..]
@@ -240,7 +303,7 @@ impl Medium {
         &self,
         schedule: &Schedule,
         queue: &[QueuedMessage],
-        links: &[Vec<MediumLink>],
+        links: &RadioLinks,
         radios: usize,
     ) -> Vec<f32> {
         let mut busy_ns = vec![0_u64; radios];
@@ -255,7 +318,7 @@ impl Medium {
                 busy_until_ns[radio] = busy_until_ns[radio].max(sent.end_ns);
             };
             hear(message.radio);
-            for link in &links[message.radio as usize] {
+            for link in links.of(message.radio) {
                 if f64::from(link.power_mw) >= self.busy_mw {
                     hear(link.radio);
                 }
@@ -303,7 +366,7 @@ mod tests {
             let message = &queue[sent.queued];
             let overlapping: Vec<&Transmission> = schedule.overlapping(number).collect();
             decoded.clear();
-            for link in &links[message.radio as usize] {
+            for link in links.of(message.radio) {
                 // A radio cannot hear while it sends.
                 if overlapping.iter().any(|other| queue[other.queued].radio == link.radio) {
                     continue;
@@ -325,7 +388,7 @@ mod tests {
                 let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
                 for other in &overlapping {
                     let disturbing = &queue[other.queued];
-                    if let Some(disturber) = link_to(&links[disturbing.radio as usize], link.radio) {
+                    if let Some(disturber) = link_to(links.of(disturbing.radio), link.radio) {
                         disturbance_mw += faded_mw(disturber.power_mw, disturber.twice_shape, draws(disturbing));
                         disturbed_ns += sent.overlap_ns(other);
                     }
@@ -355,24 +418,35 @@ mod tests {
         }
     }
 
-    /// Links with these powers in dBm, without fading; NaN = none.
-    fn links(power_dbm: &[&[f64]]) -> Vec<Vec<MediumLink>> {
-        let row = |row: &&[f64]| {
-            let link = |(radio, power): (usize, &f64)| {
+    /// Links with these powers in dBm from each radio to those after it, without fading; NaN = none.
+    fn links(power_dbm: &[&[f64]]) -> RadioLinks {
+        let row = |(first, row): (usize, &&[f64])| {
+            let link = |(place, power): (usize, &f64)| {
                 (!power.is_nan()).then(|| MediumLink {
-                    radio: radio as u32,
+                    radio: (first + 1 + place) as u32,
                     power_mw: milliwatts(*power) as f32,
                     twice_shape: 0,
                 })
             };
             row.iter().enumerate().filter_map(link).collect()
         };
-        power_dbm.iter().map(row).collect()
+        RadioLinks::new(&power_dbm.iter().enumerate().map(row).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn a_link_stands_in_the_rows_of_both_radios() {
+        let links = links(&[&[-60.0, f64::NAN, -70.0], &[-80.0, f64::NAN], &[f64::NAN], &[]]);
+        let rows = (0..4).map(|radio| links.of(radio).iter().map(|link| link.radio).collect());
+        assert_eq!(
+            rows.collect::<Vec<Vec<u32>>>(),
+            [vec![1, 3], vec![0, 2], vec![1], vec![0]]
+        );
+        assert_eq!(links.of(3)[0].power_mw, links.of(0)[1].power_mw);
     }
 
     #[test]
     fn a_station_waits_while_it_hears_another_and_then_backs_off() {
-        let near = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let near = links(&[&[-60.0], &[]]);
         let queue = [message(0, 1_000_000), message(1, 1_100_000)];
         let schedule = medium().schedule(&queue, &near, &RadioRandom::new(1));
         let [first, second] = schedule.on_air[..] else {
@@ -382,14 +456,14 @@ mod tests {
         let waited_ns = second.start_ns - first.end_ns - AIFS_NS;
         assert!(second.queued == 1 && waited_ns.is_multiple_of(SLOT_NS) && waited_ns <= 7 * SLOT_NS);
         // Below the threshold of carrier sense it is not heard.
-        let deaf = links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
+        let deaf = links(&[&[-86.0], &[]]);
         let schedule = medium().schedule(&queue, &deaf, &RadioRandom::new(1));
         assert_eq!(schedule.on_air[1].start_ns, 1_100_000);
     }
 
     #[test]
     fn stations_that_begin_at_once_collide() {
-        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let links = links(&[&[-60.0], &[]]);
         let queue = [message(0, 5_000), message(1, 9_000)];
         let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
         assert_eq!(schedule.on_air[1].start_ns, 9_000);
@@ -397,16 +471,17 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_into_the_tick_is_dropped() {
-        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let links = links(&[&[-60.0], &[]]);
         let queue = [message(0, 99_400_000), message(1, 99_450_000)];
         let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
         assert_eq!((schedule.on_air.len(), schedule.dropped), (1, 1));
     }
 
-    fn decoded_by(queue: &[QueuedMessage], links: &[Vec<MediumLink>], number: usize) -> Vec<u32> {
+    fn decoded_by(queue: &[QueuedMessage], links: &RadioLinks, number: usize) -> Vec<u32> {
         let (medium, random) = (medium(), RadioRandom::new(1));
         let schedule = medium.schedule(queue, links, &random);
-        let stations: Vec<u32> = (100..100 + links.len() as u32).collect();
+        let radios = links.starts.len() as u32 - 1;
+        let stations: Vec<u32> = (100..100 + radios).collect();
         let mut decoded = Vec::new();
         let on_air = OnAir {
             schedule: &schedule,
@@ -416,8 +491,9 @@ mod tests {
         };
         medium.receivers(number, &on_air, &random, &mut decoded);
         let table = DecodingTable::default();
-        let by_receiver = Receptions::new(&medium, &table, on_air, &random).decoded(1);
-        let receivers = (0..links.len() as u32).filter(|radio| by_receiver[*radio as usize].contains(&(number as u32)));
+        let mut by_receiver = vec![Vec::new(); stations.len()];
+        Receptions::new(&medium, &table, on_air, &random).decode(1, &mut by_receiver);
+        let receivers = (0..radios).filter(|radio| by_receiver[*radio as usize].contains(&(number as u32)));
         assert_eq!(receivers.collect::<Vec<_>>(), decoded);
         decoded
     }
@@ -433,7 +509,7 @@ mod tests {
             };
             let links: Vec<Vec<MediumLink>> = (0..stations)
                 .map(|radio| {
-                    let others = (0..stations).filter(|other| *other != radio);
+                    let others = radio + 1..stations;
                     let link = |other: usize| {
                         let [power, shape, exists, _] = draw(radio, other, 0);
                         (exists < 0.8).then(|| MediumLink {
@@ -445,6 +521,7 @@ mod tests {
                     others.filter_map(link).collect()
                 })
                 .collect();
+            let links = RadioLinks::new(&links);
             let queue: Vec<QueuedMessage> = (0..2 * stations)
                 .map(|place| {
                     let [ready, bytes, ..] = draw(place, place, 1);
@@ -463,8 +540,10 @@ mod tests {
             let on_air = OnAir { schedule: &schedule, queue: &queue, links: &links, stations: &stations };
             let table = DecodingTable::default();
             let receptions = Receptions::new(&medium, &table, on_air, &random);
-            let by_receiver = receptions.decoded(1);
-            prop_assert_eq!(&by_receiver, &receptions.decoded(3));
+            let [mut by_receiver, mut same] = [1, 3].map(|_| vec![Vec::new(); stations.len()]);
+            receptions.decode(1, &mut by_receiver);
+            receptions.decode(3, &mut same);
+            prop_assert_eq!(&by_receiver, &same);
             let mut decoded = Vec::new();
             for number in 0..schedule.on_air.len() {
                 medium.receivers(number, &on_air, &random, &mut decoded);
@@ -479,26 +558,20 @@ mod tests {
     #[test]
     fn hidden_stations_disturb_each_other_between_them() {
         // 0 and 2 do not hear each other; 1 hears both equally strong; 3 hears only 0.
-        let hidden = links(&[
-            &[f64::NAN, -70.0, f64::NAN, -70.0],
-            &[-70.0, f64::NAN, -70.0, f64::NAN],
-            &[f64::NAN, -70.0, f64::NAN, f64::NAN],
-            &[-70.0, f64::NAN, f64::NAN, f64::NAN],
-        ]);
+        let hidden = |first_dbm: f64| links(&[&[first_dbm, f64::NAN, -70.0], &[-70.0, f64::NAN], &[f64::NAN], &[]]);
+        let (hidden, near) = (hidden(-70.0), hidden(-50.0));
         let both = [message(0, 1_000_000), message(2, 1_100_000)];
         assert_eq!(decoded_by(&both, &hidden, 0), [3]);
         assert_eq!(decoded_by(&both, &hidden, 1), Vec::<u32>::new());
         let one = [message(0, 1_000_000)];
         assert_eq!(decoded_by(&one, &hidden, 0), [1, 3]);
         // 20 dB stronger it is decoded all the same.
-        let mut near = hidden;
-        near[0][0].power_mw *= 100.0;
         assert_eq!(decoded_by(&both, &near, 0), [1, 3]);
     }
 
     #[test]
     fn a_radio_that_sends_does_not_hear() {
-        let deaf = links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
+        let deaf = links(&[&[-86.0], &[]]);
         let queue = [message(0, 1_000_000), message(1, 1_100_000)];
         assert_eq!(decoded_by(&queue, &deaf, 0), Vec::<u32>::new());
         assert_eq!(decoded_by(&queue[..1], &deaf, 0), [1]);
@@ -507,7 +580,7 @@ mod tests {
     #[test]
     fn the_load_counts_every_busy_time_once() {
         // 1 hears 0 and 2, which overlap by all but 0.1 ms; 0 hears only itself.
-        let hidden = links(&[&[f64::NAN, -70.0, f64::NAN], &[], &[f64::NAN, -70.0, f64::NAN]]);
+        let hidden = links(&[&[-70.0, f64::NAN], &[-70.0], &[]]);
         let queue = [message(0, 1_000_000), message(2, 1_100_000)];
         let schedule = medium().schedule(&queue, &hidden, &RadioRandom::new(1));
         let load = medium().channel_load(&schedule, &queue, &hidden, 3);
@@ -539,6 +612,7 @@ mod tests {
                 }],
                 Vec::new(),
             ];
+            let links = RadioLinks::new(&links);
             let mut decoded = Vec::new();
             let delivered = (0..MESSAGES).filter(|number| {
                 let queue = [QueuedMessage {
