@@ -97,6 +97,13 @@ struct RadioPair {
     between: LinkObstruction,
 }
 
+impl RadioPair {
+    const NONE: Self = Self {
+        second: 0,
+        between: LinkObstruction::CLEAR,
+    };
+}
+
 /// What a thread uses for one radio after the other.
 #[derive(Default)]
 struct PairRoom {
@@ -124,6 +131,8 @@ pub struct LinkComputer {
     /// By radio: links to those after it. Kept for its memory.
     to_later: Vec<Vec<MediumLink>>,
     shadows: RadioShadows,
+    /// x, y and height of the radios of the tick, metres.
+    places_m: [Vec<f64>; 3],
     strips: OpenStrips,
 }
 
@@ -166,6 +175,7 @@ impl LinkComputer {
             witnesses: Vec::new(),
             to_later: Vec::new(),
             shadows: RadioShadows::default(),
+            places_m: [const { Vec::new() }; 3],
             strips: OpenStrips::default(),
         }
     }
@@ -204,6 +214,13 @@ impl LinkComputer {
             .map(|radio| Bounds::about(radio.antenna.position_m, 0.0))
             .collect();
         let index = Grid::new(&bounds, 0.25 * self.config.range_m);
+        for (axis, column) in self.places_m.iter_mut().enumerate() {
+            column.clear();
+            column.extend(radios.iter().map(|Radio { antenna, .. }| match axis {
+                2 => antenna.z_m,
+                _ => antenna.position_m[axis],
+            }));
+        }
         let this = &*self;
         let threads = this.config.threads as usize;
         parallel::for_each_with(threads, &mut turns, PairRoom::default, |room, first, turn| {
@@ -244,37 +261,44 @@ impl LinkComputer {
                 room.near[number / 64] |= u64::from(number > first) << (number % 64);
             }
         });
-        room.pairs.clear();
         room.terms.clear();
         room.kept.clear();
+        // Each radio nearby is written, and stays if it is in range: one in four is not, so a branch would often be wrong.
+        let most = room.near.iter().map(|word| word.count_ones() as usize).sum();
+        room.pairs.resize(most, RadioPair::NONE);
+        room.terms.flat2_m2.resize(most, 0.0);
+        room.terms.height_m.resize(most, 0.0);
+        let [xs, ys, zs] = &self.places_m;
+        let (x, y, z) = (a.position_m[0], a.position_m[1], a.z_m);
+        let range2_m2 = self.config.range_m * self.config.range_m;
+        let mut count = 0;
         let mut before = turn.witnesses.iter().peekable();
         for (place, mut word) in room.near.iter().copied().enumerate() {
             while word != 0 {
                 let second = 64 * place + word.trailing_zeros() as usize;
                 word &= word - 1;
-                let b = &tick.radios[second];
                 if !sends && !tick.sends[second] {
                     // What is known of it is kept.
-                    while before.next_if(|witness| (witness.slot as usize) < b.slot).is_some() {}
+                    let slot = tick.radios[second].slot;
+                    while before.next_if(|witness| (witness.slot as usize) < slot).is_some() {}
                     room.kept
-                        .extend(before.next_if(|witness| witness.slot as usize == b.slot));
+                        .extend(before.next_if(|witness| witness.slot as usize == slot));
                     continue;
                 }
-                let [dx, dy] = [
-                    b.antenna.position_m[0] - a.position_m[0],
-                    b.antenna.position_m[1] - a.position_m[1],
-                ];
+                let [dx, dy] = [xs[second] - x, ys[second] - y];
                 let flat2_m2 = dx * dx + dy * dy;
-                if flat2_m2 <= self.config.range_m * self.config.range_m {
-                    room.pairs.push(RadioPair {
-                        second: second as u32,
-                        between: LinkObstruction::CLEAR,
-                    });
-                    room.terms.flat2_m2.push(flat2_m2);
-                    room.terms.height_m.push(b.antenna.z_m - a.z_m);
-                }
+                room.pairs[count] = RadioPair {
+                    second: second as u32,
+                    between: LinkObstruction::CLEAR,
+                };
+                room.terms.flat2_m2[count] = flat2_m2;
+                room.terms.height_m[count] = zs[second] - z;
+                count += usize::from(flat2_m2 <= range2_m2);
             }
         }
+        room.pairs.truncate(count);
+        room.terms.flat2_m2.truncate(count);
+        room.terms.height_m.truncate(count);
     }
 
     /// Finds what is between the radios of each pair.
@@ -332,7 +356,6 @@ impl LinkComputer {
     fn link(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &mut PairRoom) {
         let a = &tick.radios[first];
         let PairRoom { pairs, terms, .. } = room;
-        turn.links.clear();
         let state = |pair: &RadioPair| pair.between.state as usize;
         let [at_1_m_dbm, decade_db, shadowing_db] = &self.terms_of_states;
         terms
@@ -354,32 +377,29 @@ impl LinkComputer {
             terms,
             least_dbm: self.least_dbm,
         });
+        // As above: two of three pairs do not count.
+        turn.links.resize(pairs.len(), MediumLink::NONE);
+        let mut count = 0;
         for (place, (pair, power_mw)) in pairs.iter().zip(&terms.power_mw).enumerate() {
-            // Most pairs do not count.
-            if *power_mw == 0.0 {
-                continue;
+            let mut power_mw = *power_mw;
+            if power_mw.is_nan() {
+                let b = &tick.radios[pair.second as usize];
+                let distance_m = (terms.flat2_m2[place] + terms.height_m[place].powi(2)).sqrt();
+                let power_dbm = self.power_dbm([a, b], pair.between, distance_m, || terms.normal[place]);
+                power_mw = power_dbm.map_or(0.0, |power_dbm| milliwatts(power_dbm) as f32);
             }
-            let power_mw = match power_mw.is_nan() {
-                false => *power_mw,
-                true => {
-                    let b = &tick.radios[pair.second as usize];
-                    let distance_m = (terms.flat2_m2[place] + terms.height_m[place].powi(2)).sqrt();
-                    match self.power_dbm([a, b], pair.between, distance_m, || terms.normal[place]) {
-                        Some(power_dbm) => milliwatts(power_dbm) as f32,
-                        None => continue,
-                    }
-                }
+            let twice_shape = match self.config.fading {
+                true => terms.twice_shape[place],
+                false => 0,
             };
-            turn.links.push(MediumLink {
+            turn.links[count] = MediumLink {
                 radio: pair.second,
                 power_mw,
-                twice_shape: if self.config.fading {
-                    terms.twice_shape[place]
-                } else {
-                    0
-                },
-            });
+                twice_shape,
+            };
+            count += usize::from(power_mw != 0.0);
         }
+        turn.links.truncate(count);
     }
 
     /// Loss of a link behind vehicles with its random part, without what distance adds, dB; and 1 if distance adds to it, else 0.

@@ -48,6 +48,15 @@ pub struct MediumLink {
     pub twice_shape: u32,
 }
 
+impl MediumLink {
+    /// A place where a link is to be written.
+    pub(super) const NONE: Self = Self {
+        radio: 0,
+        power_mw: 0.0,
+        twice_shape: 0,
+    };
+}
+
 /// The links of all radios of a tick, in rows. A link is the same in both directions, and stands in the rows of both of its radios.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RadioLinks {
@@ -81,13 +90,8 @@ impl RadioLinks {
         for radio in 0..to_later.len() {
             starts[radio + 1] += starts[radio];
         }
-        let none = MediumLink {
-            radio: 0,
-            power_mw: 0.0,
-            twice_shape: 0,
-        };
         // Each is written below.
-        links.resize(starts[to_later.len()] as usize, none);
+        links.resize(starts[to_later.len()] as usize, MediumLink::NONE);
         next.clone_from(starts);
         // In a row come first those before it, then those after it.
         for (radio, later) in to_later.iter().enumerate() {
