@@ -1,11 +1,11 @@
-//! Powers of many links at once. Logarithm and exponential are polynomials, whose error is far below the last digit of the result: an f32.
-//! So nearly every power is that of the formulas bit for bit, and the others are left to them.
+//! Powers of many links at once. Logarithm and exponential are polynomials whose error is far below the last digit of the result, an f32.
+//! So nearly every power is that of the formulas bit for bit. Where rounding or a threshold leaves it open, the formulas decide.
 
 use sensor_daemon::wide::VectorWork;
 
 /// More than what a power may be wrong by, dB.
 const ERROR_DB: f64 = 1e-10;
-/// More than what ten times the logarithm of a power is worth as a share of the power: ln 10 / 10, and rounding.
+/// The same as a share of the power. One dB is a share of ln 10 / 10 = 0.23.
 const ERROR_SHARE: f64 = 0.3 * ERROR_DB;
 
 /// What adds up to the power of the links of one radio, a column for each term.
@@ -19,7 +19,7 @@ pub struct LinkTerms {
     pub at_1_m_dbm: Vec<f64>,
     /// Loss for each decade of distance, dB.
     pub decade_db: Vec<f64>,
-    /// Standard deviation of shadowing, dB, and its standard normal number.
+    /// Standard deviation of shadowing, dB; 0 without fading.
     pub shadowing_db: Vec<f64>,
     /// Its standard normal number.
     pub normal: Vec<f64>,

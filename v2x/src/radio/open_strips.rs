@@ -18,17 +18,19 @@ const REACH_M: [f64; 2] = [500.0, 8.0];
 const CLEARANCE_M: f64 = 0.3;
 /// A shorter or narrower strip is not worth its place, metres.
 const LEAST_M: [f64; 2] = [60.0, 6.0];
-/// A wall within this angle of the line between two radios gives a strip its direction, as a sine.
+/// A wall within this angle of the line between two radios gives the strip about them its direction, as a sine.
 const SAME_DIRECTION: f64 = 0.25;
 /// How far from the middle of a pair such a wall may be, metres.
 const WALL_AWAY_M: f64 = 30.0;
-/// Most strips that a radio counts as in.
+/// Most strips that a radio counts as in. Where there are so many, no more are grown.
 const STRIPS_OF_RADIO: usize = 4;
 /// Size of the cells of the index over strips, metres.
 const CELL_M: f64 = 25.0;
 /// Attempts to grow a strip that may fail before the first one succeeds, and those that each tick adds.
 const FIRST_ATTEMPTS: u32 = 50;
 const ATTEMPTS_OF_TICK: u32 = 2;
+/// Most strips that a tick adds: their search takes some 30 µs each.
+const STRIPS_OF_TICK: u32 = 64;
 /// More than what a distance in f32 may be wrong by, metres.
 const ROUNDING_M: f32 = 0.02;
 
@@ -217,22 +219,34 @@ impl OpenStrips {
     /// Grows strips about pairs of points between which no building is, and that no strip holds yet.
     pub fn grow(&mut self, obstacles: &Obstacles, pairs: impl Iterator<Item = [Point; 2]>) {
         self.attempts = FIRST_ATTEMPTS.min(self.attempts + ATTEMPTS_OF_TICK);
-        for [a, b] in pairs {
-            if self.attempts == 0 {
+        let mut strips_of_tick = 0;
+        for pair in pairs {
+            if self.attempts == 0 || strips_of_tick == STRIPS_OF_TICK {
                 return;
             }
-            let holds = |number: &u32| {
-                let strip = &self.strips[*number as usize];
-                [a, b].iter().all(|point| strip.holds(strip.coordinates(*point)))
-            };
-            if self.cells.get(&cell_of(a)).is_some_and(|near| near.iter().any(holds)) {
+            let [of_a, of_b] = pair.map(|point| self.holding(point));
+            let is_full = of_a.len() >= STRIPS_OF_RADIO || of_b.len() >= STRIPS_OF_RADIO;
+            if is_full || of_a.iter().any(|strip| of_b.contains(strip)) {
                 continue;
             }
-            match OpenStrip::about(obstacles, a, b) {
-                Some(strip) => self.add(strip),
+            match OpenStrip::about(obstacles, pair[0], pair[1]) {
+                Some(strip) => {
+                    self.add(strip);
+                    strips_of_tick += 1;
+                }
                 None => self.attempts -= 1,
             }
         }
+    }
+
+    /// Numbers of the strips that hold a point.
+    fn holding(&self, point: Point) -> Vec<u32> {
+        let near = self.cells.get(&cell_of(point)).into_iter().flatten();
+        let holds = |number: &&u32| {
+            let strip = &self.strips[**number as usize];
+            strip.holds(strip.coordinates(point))
+        };
+        near.filter(holds).copied().collect()
     }
 
     /// A cell that is missing in the index only makes links in it slower, so cells are found by points half a cell apart.

@@ -15,7 +15,7 @@ mod street;
 
 const USAGE: &str = "\
 usage: v2x-bench [--quick] [--json FILE]
-       v2x-bench cost [STATIONS …] [--threads=N] [--cam]
+       v2x-bench cost [STATIONS …] [--threads=N] [--cam | --cpm]
 
 Measures messages between vehicles in streets with houses; `caraware bench v2x` starts it. `cost` measures what
 the exchange costs: CAMs alone, then CAMs and CPMs.
@@ -23,7 +23,8 @@ the exchange costs: CAMs alone, then CAMs and CPMs.
   --quick      a small measurement, whose figures say nothing
   --json FILE  where the figures go
   --threads=N  of the exchange
-  --cam        leaves CPMs out";
+  --cam        leaves CPMs out
+  --cpm        leaves the run without CPMs out";
 
 fn main() {
     ipc_schema::process_main::answer_help(USAGE);
