@@ -1,4 +1,5 @@
-//! The default learner on a scenario: it corrects fixes instead of naming places in a map that may be any size (decision 33).
+//! What the default learner does where the user says no more: on a scenario it corrects fixes instead of naming places in a map that may
+//! be any size (decision 33), and where the world takes its actions it tries one.
 
 use serde_json::Value;
 
@@ -30,6 +31,16 @@ pub fn suggest_correction(settings: &mut LayeredSettings, source: &str) {
     settings.suggest("observation.history", Value::from(CORRECTING_HISTORY), source);
 }
 
+/// Lets our learner try one action on an observation where the world takes its actions, unless the user asks for several.
+pub fn suggest_one_action(settings: &mut LayeredSettings) {
+    let draws = ["driving", "messages"]
+        .iter()
+        .any(|task| settings.has_text("task.kind", task));
+    if draws {
+        settings.suggest("trainer.actions_per_observation", Value::from(1), "task.kind");
+    }
+}
+
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 mod tests {
@@ -37,9 +48,26 @@ mod tests {
 
     use super::*;
 
-    fn config_of(sets: &[&str]) -> Config {
+    fn settings_of(sets: &[&str]) -> LayeredSettings {
         let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
-        let mut settings = LayeredSettings::defaults().unwrap().with_assignments(&sets).unwrap();
+        LayeredSettings::defaults().unwrap().with_assignments(&sets).unwrap()
+    }
+
+    #[test]
+    fn the_world_takes_one_action_unless_the_user_asks_for_several() {
+        let tries = |sets: &[&str]| {
+            let mut settings = settings_of(sets);
+            suggest_one_action(&mut settings);
+            settings.validate().map(|config| config.trainer.actions_per_observation)
+        };
+        assert_eq!(tries(&[]).unwrap(), 8);
+        let drives = ["task.kind=driving", "traffic.heroes=1"];
+        assert_eq!(tries(&drives).unwrap(), 1);
+        assert!(tries(&[&drives[..], &["trainer.actions_per_observation=8"]].concat()).is_err());
+    }
+
+    fn config_of(sets: &[&str]) -> Config {
+        let mut settings = settings_of(sets);
         suggest_correction(&mut settings, "a.sumocfg");
         settings.validate().unwrap()
     }

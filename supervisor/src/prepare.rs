@@ -17,7 +17,7 @@ use crate::{
     checkpoint::{self, FoundCheckpoint},
     cli::{PlayArgs, RunArgs},
     config::{self, ConfigError, LayeredSettings},
-    correction::suggest_correction,
+    correction::{suggest_correction, suggest_one_action},
     failure::Exit,
     install::Install,
     interruption::InterruptionWatch,
@@ -75,6 +75,7 @@ impl TrafficInput {
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
     let (mut settings, named, label) = resolve_config(&args.with_shorthands()?)?;
     scenario_settings::check_length(&settings, mode, named.is_scenario())?;
+    suggest_one_action(&mut settings);
     if let (Mode::Train, TrafficInput::Scenario(path, _)) = (mode, &named) {
         suggest_correction(&mut settings, &path.display().to_string());
     }
@@ -99,6 +100,7 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     let (settings, named) = match &args.run.config {
         Some(name) => {
             let (mut settings, named, _) = resolve_config(&args.run.with_shorthands()?)?;
+            suggest_one_action(&mut settings);
             if found.run()?.config.task.action == LocalisationAction::Correction {
                 suggest_correction(&mut settings, name);
             }

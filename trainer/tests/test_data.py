@@ -133,7 +133,7 @@ def test_parquet_and_csv_have_the_values_of_the_messages(recording: Recording, r
         assert columns["predicted_x_m"][row] == answer[0]
         error_m = math.hypot(*(answer[:2].astype(float) - truth[:2]))
         assert columns["predicted_error_m"][row] == pytest.approx(error_m, rel=1e-4)
-        assert columns["reward"][row] == pytest.approx(1 / (1 + error_m / 5), rel=1e-4)
+        assert columns["reward"][row] == pytest.approx(1 / (1 + error_m / 30), rel=1e-4)
     # What is there is kept: an export continues where it was interrupted.
     (directory / "episode-00001.parquet").unlink()
     kept = (directory / "episode-00000.parquet").stat().st_mtime_ns

@@ -67,7 +67,7 @@ def test_torchrl_reads_actions_rewards_and_truth_of_the_same_tick() -> None:
         error_m = (predicted_m - rollout["truth"][..., :2].double()).norm(dim=-1)
         assert torch.allclose(
             rollout["next", "reward"][..., 0].double()[rollout["mask"]],
-            1 / (1 + error_m[rollout["mask"]] / 5),
+            1 / (1 + error_m[rollout["mask"]] / 30),
             atol=1e-5,
         )
 

@@ -23,6 +23,7 @@ NOISELESS = {
     "episode.final_evaluations": 1,
     "trainer.horizon": 500,
     "trainer.batch_size": 250,
+    "trainer.actions_per_observation": 1,
     "fanout.enabled": "false",
 }
 

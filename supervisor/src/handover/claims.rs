@@ -117,6 +117,7 @@ mod tests {
     fn each_claim_is_compared_with_the_run() {
         let speaks = [
             "task.kind=messages",
+            "trainer.actions_per_observation=1",
             "v2x.share=1.0",
             "v2x.candidates=5",
             "v2x.perception_range_m=60",

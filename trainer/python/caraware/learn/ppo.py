@@ -28,6 +28,7 @@ from caraware.learn.config import TrainerConfig
 from caraware.learn.drawing import DrawingPredictor
 from caraware.learn.gae import generalised_advantage
 from caraware.learn.networks import GaussianPolicy, entropy, log_probability
+from caraware.learn.noise import action_noise
 from caraware.learn.prediction import Predictor, RowPredictor
 from caraware.learn.rollout import DrawnHorizon, DrawnTick, Horizon
 from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, PPO, RANDOM, LearnerShape, StoredTensors
@@ -435,7 +436,7 @@ class Ppo:
         tries = self.config.actions_per_observation
         step = TaskStep(forward.observation, truth)
         centre = mean if tries == 1 else mean.unsqueeze(1)
-        noise = self._noise(len(mean), tries, self._samplings[environment]).to(self.device)
+        noise = action_noise(len(mean), tries, self.task.actions.size, self._samplings[environment]).to(self.device)
         action = centre + log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
         reward = self.task.reward(step, action)
         if tries == 1:
@@ -476,17 +477,6 @@ class Ppo:
             vehicle=horizon.vehicle.flatten()[rows],
             tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
         )
-
-    def _noise(self, samples: int, tries: int, generator: torch.Generator) -> Tensor:
-        """Standard normal `[samples, tries, a]`; an even number of tries comes in pairs on both sides of the mean.
-
-        Each is still a sample of the policy, and the mean gradient that of the policy. What two opposite actions have
-        in common drops out of it, which is most of its variance (antithetic variates; Owen, Monte Carlo, section 8.2).
-        """
-        if tries % 2:
-            return torch.randn(samples, tries, self.task.actions.size, generator=generator)
-        half = torch.randn(samples, tries // 2, self.task.actions.size, generator=generator)
-        return torch.cat((half, -half), 1)
 
     def _advantages(self, horizon: Horizon, forward: ForwardPass, reward: Tensor) -> tuple[Tensor, Tensor]:
         """Advantages and value targets `[s]` of the samples, by way of the `[T, N]` grid that GAE needs."""
