@@ -327,7 +327,8 @@ pub struct HandoverArgs {
 const VIEW: &str = "Examples:
   caraware view                          show the run on this machine in a window (in a browser if there is no screen)
   caraware view --web                    print an address, for any number of browsers
-  caraware view --save run.rrd           record; open it later with `.venv/bin/rerun run.rrd`
+  caraware view --save run.rrd           record
+  caraware view run.rrd                  show the recording, with a time line
   caraware view town-2                   show one of several runs
   caraware view --vehicle cav.3 --lidar all
   caraware view --camera cav.3@front --radar cav.3
@@ -342,7 +343,7 @@ Another machine needs neither Rust nor this command, only the viewer (pip instal
 /// Arguments of `view`.
 #[derive(Debug, Args, Clone)]
 pub struct ViewArgs {
-    /// Name of a run on this machine, or an endpoint as tcp/HOST:PORT [default: the only run alive]
+    /// Name of a run on this machine, an endpoint as tcp/HOST:PORT, or a file of --save [default: the only run alive]
     pub endpoint: Option<String>,
     /// Serve browsers on this machine, and print the address
     #[arg(long)]

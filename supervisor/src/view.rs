@@ -79,9 +79,9 @@ struct ViewTarget {
 }
 
 impl ViewTarget {
-    /// Uses `text` if it is an endpoint. Otherwise `text` names a live run of this machine; without `text` it is the only live run.
+    /// Uses `text` if it is an endpoint or a saved file. Otherwise `text` names a live run of this machine; without `text` it is the only live run.
     fn find(text: Option<&str>) -> Result<Self, Exit> {
-        if let Some(endpoint) = text.filter(|text| is_endpoint(text)) {
+        if let Some(endpoint) = text.filter(|text| is_endpoint(text) || is_saved(text)) {
             return Ok(Self {
                 endpoint: endpoint.to_owned(),
                 run: None,
@@ -108,6 +108,11 @@ impl ViewTarget {
             run: Some(run.name.clone()),
         })
     }
+}
+
+/// True for the path of a file that a viewer has saved. The viewer takes it in the endpoint's place.
+fn is_saved(text: &str) -> bool {
+    Path::new(text).extension().is_some_and(|extension| extension == "rrd")
 }
 
 /// True for `tcp/host:port` and other protocols in this form.
@@ -271,6 +276,18 @@ impl Drop for ViewerProcess {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_saved_file_stands_in_the_place_of_an_endpoint() {
+        for path in ["run.rrd", "lab/a run.rrd", "./run.rrd"] {
+            let expected = ViewTarget {
+                endpoint: path.into(),
+                run: None,
+            };
+            assert_eq!(ViewTarget::find(Some(path)).unwrap(), expected);
+        }
+        assert!(!is_saved("rrd") && !is_saved("town-1"));
+    }
 
     #[test]
     fn endpoints_are_distinguished_from_names() {

@@ -17,6 +17,7 @@ os.environ.setdefault("CI", "1")
 from caraware_viewer import access, command
 from caraware_viewer.display import DisplayError
 from caraware_viewer.link import LinkError
+from caraware_viewer.saved import SavedError, is_saved, show_saved
 from caraware_viewer.watch import watch_run
 
 INTERRUPTED = 130
@@ -28,7 +29,8 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _EXAMPLES = """Examples:
   caraware-viewer                                  the run on this machine, in a window
   caraware-viewer --web                            in a browser; prints the address to open
-  caraware-viewer --save run.rrd                   record; open it later with `rerun run.rrd`
+  caraware-viewer --save run.rrd                   record
+  caraware-viewer run.rrd                          show the recording, with a time line
   caraware-viewer --web --save run.rrd             both
   caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with all LIDAR points
   caraware-viewer --camera cav.3@front             the images of the camera `front` of cav.3's suite, with boxes
@@ -52,8 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
     try:
+        if is_saved(options.endpoint):
+            return show_saved(options, parser().parse_args([]))
         return watch_run(options)
-    except (LinkError, access.AccessError, DisplayError) as error:
+    except (LinkError, access.AccessError, DisplayError, SavedError) as error:
         print(f"caraware-viewer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -82,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
         nargs="?",
         type=_endpoint,
         default=DEFAULT_ENDPOINT,
-        help="the run's `fanout.listen` (default %(default)s)",
+        help="the run's `fanout.listen` (default %(default)s), or a file that --save has written",
     )
     parser.add_argument("--run", metavar="NAME", help="name of the run, if the endpoint has several")
     parser.add_argument(
@@ -163,7 +167,7 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
 
 
 def _endpoint(text: str) -> str:
-    if not re.fullmatch(r"[a-z][a-z-]*/\S+:\d{1,5}", text):
+    if not is_saved(text) and not re.fullmatch(r"[a-z][a-z-]*/\S+:\d{1,5}", text):
         raise argparse.ArgumentTypeError(f"{text!r} is not an endpoint: write tcp/HOST:PORT, as in {DEFAULT_ENDPOINT}")
     return text
 

@@ -64,24 +64,26 @@ class Display:
         self._process = process
 
     @classmethod
-    def window(cls) -> Display:
-        """Opens a window."""
+    def window(cls, file: Path | None = None) -> Display:
+        """Opens a window, which shows `file` if there is one."""
         port = free_port(GRPC_PORT)
-        process = _start(
-            "--port", str(port), "--hide-welcome-screen", "--expect-data-soon", "--memory-limit", WINDOW_MEMORY
-        )
+        options = ["--port", str(port), "--hide-welcome-screen", "--memory-limit", WINDOW_MEMORY]
+        process = _start(*options, *(["--expect-data-soon"] if file is None else [str(file)]))
         _wait_for(process, port)
         return cls(process, port)
 
     @classmethod
-    def web(cls, web_port: int | None = None, memory_mib: float = SERVER_MEMORY_MIB) -> Display:
+    def web(
+        cls, web_port: int | None = None, memory_mib: float = SERVER_MEMORY_MIB, file: Path | None = None
+    ) -> Display:
         """Serves browsers at `web_port`; without one, at 9090 if it is free, else at another port.
 
-        rerun's server keeps `memory_mib` for browsers that join later.
+        rerun's server keeps `memory_mib` for browsers that join later. It serves `file` if there is one.
         """
         grpc_port, upstream_port = free_port(GRPC_PORT), free_port(0)
-        ports = ("--port", str(grpc_port), "--web-viewer-port", str(upstream_port))
-        process = _start("--serve-web", *ports, "--server-memory-limit", f"{memory_mib:.0f}MiB")
+        options = ["--port", str(grpc_port), "--web-viewer-port", str(upstream_port)]
+        options += ["--server-memory-limit", f"{memory_mib:.0f}MiB"]
+        process = _start("--serve-web", *options, *([] if file is None else [str(file)]))
         try:
             _wait_for(process, grpc_port)
             _wait_for(process, upstream_port)
@@ -95,6 +97,18 @@ class Display:
             process.kill()
             raise
         return cls(process, grpc_port, page)
+
+    @classmethod
+    def chosen(
+        cls, web_port: int | None, *, web: bool, memory_mib: float = SERVER_MEMORY_MIB, file: Path | None = None
+    ) -> Display:
+        """A window; browsers if `web` or `web_port` asks for them, or if there is no screen."""
+        if not (web or web_port or has_screen()):
+            print("no screen was found (DISPLAY is not set): serving a browser instead, as with --web", file=sys.stderr)
+            web = True
+        if web or web_port:
+            return cls.web(web_port, memory_mib, file)
+        return cls.window(file)
 
     @property
     def pid(self) -> int:

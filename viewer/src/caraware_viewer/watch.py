@@ -14,7 +14,7 @@ import rerun as rr
 
 from caraware_viewer import access
 from caraware_viewer.detail import Region
-from caraware_viewer.display import Display, has_screen
+from caraware_viewer.display import Display
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import RunLink, connect, find_run
 from caraware_viewer.mounted import CAMERA, OFF, RADAR, carriers, check_choices
@@ -204,9 +204,4 @@ def _wants_display(options: argparse.Namespace) -> bool:
 def _open_display(options: argparse.Namespace, memory_mib: float) -> contextlib.AbstractContextManager[Display | None]:
     if not _wants_display(options):
         return contextlib.nullcontext()
-    if options.web or options.web_port:
-        return Display.web(options.web_port, memory_mib)
-    if not has_screen():
-        print("no screen was found (DISPLAY is not set): serving a browser instead, as with --web", file=sys.stderr)
-        return Display.web(memory_mib=memory_mib)
-    return Display.window()
+    return Display.chosen(options.web_port, web=options.web, memory_mib=memory_mib)
