@@ -1,6 +1,7 @@
 """Our PPO learns to drive: in a world of one lane that listens to actions, with heroes that come and go."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -196,7 +197,12 @@ def drive(folder: Path, learning_rate: float) -> tuple[list[float], dict[str, in
 
     loop._stop_requested = note_early
     assert loop.run() and lane.is_done
-    late = loop._environments[0].trips.training - type(loop._environments[0].trips.training)(early)
+    counted = loop._environments[0].trips.training
+    late = counted - type(counted)(early)
+    # The lines of the updates count each of them once, but for those after the last update.
+    lines = [json.loads(line) for line in (folder / "learning.jsonl").read_text().splitlines()]
+    logged = sum((Counter(line.get("ends", {})) for line in lines), Counter())
+    assert logged <= counted and logged.total() > 0.9 * counted.total(), (logged, counted)
     return lane.rewards, dict(late)
 
 

@@ -192,18 +192,29 @@ class Metrics:
         self._purge_step = env_steps + 1
         self._course.resume(env_steps)
 
-    def updated(self, point: TrainingPoint, stats: "DataclassInstance", lag_ticks: int = 0, tick: int = 0) -> None:
-        """Record one update on the ticks up to `tick`, after which the simulation was `lag_ticks` ahead."""
+    def updated(
+        self,
+        point: TrainingPoint,
+        stats: "DataclassInstance",
+        lag_ticks: int = 0,
+        tick: int = 0,
+        ends: Mapping[str, int] | None = None,
+    ) -> None:
+        """Record one update on the ticks up to `tick`, after which the simulation was `lag_ticks` ahead.
+
+        `ends` are the trips that ended since the update before, by the name of their end.
+        """
         self.training.append(point)
         self._tick = tick
         figures = {"sigma": point.sigma, "reward": point.reward, **point.metrics}
-        self._course.add(
-            {"env_steps": point.env_steps, "tick": tick, "update": len(self.training), "training": _finite(figures)}
-        )
+        line = {"env_steps": point.env_steps, "tick": tick, "update": len(self.training), "training": _finite(figures)}
+        self._course.add(line | ({"ends": dict(ends)} if ends else {}))
         values = {f"update/{name}": value for name, value in asdict(stats).items()}
         for metric in self._task_metrics:
             if metric.name in point.metrics:
                 values[_tag(metric, "training")] = point.metrics[metric.name]
+        if ends:
+            values |= {f"trips/{end}_percent": 100 * count / sum(ends.values()) for end, count in ends.items()}
         values |= {"speed/env_steps_per_s": point.env_steps_per_s, "speed/lag_ticks": lag_ticks}
         self._write(values, point.env_steps)
 

@@ -24,7 +24,7 @@ from caraware.run.learner import Learner
 from caraware.run.report_part import write_part
 from caraware.run.sample_count import SampleCount
 from caraware.run.stream_position import StreamPosition
-from caraware.run.trips import has_trips, sum_of
+from caraware.run.trips import EndedTrips, has_trips, sum_of
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +61,7 @@ class TrainingLoop:
         self._leave_requested, self._left = leave_requested, False
         self._leave_now_requested, self._idle_waits = leave_now_requested, 0
         self._task, self._metrics = config.task, Metrics(config.run_dir / "tensorboard", config.task.metrics)
+        self._ended_trips = EndedTrips()
         self._learner: Learner | None = None
         self._samples, self._vehicles = SampleCount(), 0
         self._others_stopped = False
@@ -292,7 +293,10 @@ class TrainingLoop:
         env_steps = self._samples.env_steps
         point = TrainingPoint(env_steps, stats.sigma, stats.reward_mean, metrics, rate)
         tick = self._environments[0].progress.committed_tick
-        self._metrics.updated(point, stats, self._channel.lag_ticks(), tick)
+        ends = None
+        if has_trips(self._task):
+            ends = self._ended_trips.take(environment.trips.training for environment in self._environments)
+        self._metrics.updated(point, stats, self._channel.lag_ticks(), tick, ends)
         self._channel.report(
             episode=self._episode(),
             env_steps=env_steps,

@@ -37,6 +37,19 @@ class TripCounts:
             counts[name_of(int(reasons[slot]))] += 1
 
 
+class EndedTrips:
+    """The trips of training that ended since the last update."""
+
+    def __init__(self) -> None:
+        self._reported: Trips = Counter()
+
+    def take(self, counts: Iterable[Trips]) -> dict[str, int]:
+        """Those that ended since the last call, by the name of their end, of all environments together."""
+        total: Trips = Counter(sum_of(counts))
+        ended, self._reported = total - self._reported, total
+        return dict(ended)
+
+
 def sum_of(counts: Iterable[Trips]) -> dict[str, int]:
     """All together."""
     total: Trips = Counter()
