@@ -76,6 +76,22 @@ def test_a_long_run_stays_within_a_bound_and_keeps_its_ends() -> None:
     assert (steps(course)[0], steps(course)[-1]) == (1, 3 * MAX_POINTS)
 
 
+def test_trips_are_shown_as_shares_of_those_that_ended() -> None:
+    ends: tuple[dict[str, int], ...] = ({"collision": 3, "arrival": 1}, {}, {"arrival": 4}, {"off_road": 1})
+    lines = [update(number) | ({"ends": each} if each else {}) for number, each in enumerate(ends, 1)]
+    course = Course()
+    course.merge(json.dumps({"updates": lines, "evaluations": []}).encode())
+    shares = {
+        name: [(point.env_steps, point.value) for point in course.curves[training_path(f"{name}_percent")].values()]
+        for name in ("arrival", "collision", "off_road")
+    }
+    assert shares == {
+        "arrival": [(100, 25.0), (300, 100.0), (400, 0.0)],
+        "collision": [(100, 75.0), (300, 0.0), (400, 0.0)],
+        "off_road": [(400, 100.0)],
+    }
+
+
 def test_curves_of_one_unit_share_a_view() -> None:
     assert training_path("error_m").rsplit("/", 1)[0] == training_path("raw_gnss_error_m").rsplit("/", 1)[0]
     assert training_path("progress_mps").split("/")[1] == "mps"

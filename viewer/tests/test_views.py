@@ -8,7 +8,10 @@ from caraware_viewer import course, plots, space
 from caraware_viewer.views import MAX_PLOTS, PLOTS, blueprint, layout_of, mode_of, shown_plots
 
 ALL = [
-    *(f"{course.ROOT}/{name}" for name in ("m/error_m", "mps/progress_mps", "reward/reward", "sigma/sigma")),
+    *(
+        f"{course.ROOT}/{name}"
+        for name in ("m/error_m", "percent/arrival_percent", "mps/progress_mps", "reward/reward", "sigma/sigma")
+    ),
     plots.SPEED,
     plots.GNSS_ERROR,
     plots.VEHICLES,
@@ -33,7 +36,7 @@ def test_a_mode_has_its_own_plots_and_none_without_data(mode: str) -> None:
 def test_a_simulation_has_no_learning_curve() -> None:
     assert not [title for title in titles("simulate", ALL) if "whole run" in title]
     assert titles("train", ALL)[0] == "Error over the whole run (m)"
-    assert titles("drive", ALL)[0] == "Progress over the whole run (m/s)"
+    assert titles("drive", ALL)[0] == "How trips ended over the whole run (%)"
 
 
 def test_heroes_make_a_training_run_one_of_driving() -> None:

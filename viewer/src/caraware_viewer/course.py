@@ -13,6 +13,8 @@ from caraware_viewer.wire import FrameError
 
 ROOT = "learning"
 REWARD, SIGMA = f"{ROOT}/reward/reward", f"{ROOT}/sigma/sigma"
+ENDS = f"{ROOT}/percent"
+"""Root of the shares of trips that ended in one way or another since the update before."""
 MAX_POINTS = 2000
 """Most points of a curve; when more come, every second is dropped."""
 
@@ -21,6 +23,13 @@ _NAMES = {
     "raw_gnss_error_m": "raw GNSS, training",
     "progress_mps": "progress",
     "route_offset_m": "beside the route",
+    "arrival_percent": "arrived",
+    "collision_percent": "collision",
+    "off_road_percent": "off the road",
+    "red_light_percent": "red light",
+    "against_traffic_percent": "against traffic",
+    "blocked_percent": "blocked",
+    "time_limit_percent": "out of time",
     "reward": "reward",
     "sigma": "σ",
 }
@@ -38,6 +47,11 @@ COLORS: dict[str, list[int]] = {
     "sigma": [120, 200, 255],
     "progress_mps": [150, 230, 150],
     "route_offset_m": [255, 150, 200],
+    "arrival_percent": [150, 230, 150],
+    "collision_percent": [255, 90, 90],
+    "off_road_percent": [255, 170, 60],
+    "red_light_percent": [255, 120, 220],
+    "blocked_percent": [120, 200, 255],
     "ppo": [255, 255, 255],
     "raw_gnss": [255, 170, 160],
     "supervised": [255, 210, 90],
@@ -74,6 +88,8 @@ class Course:
             rows += [(line, line["evaluation"], True) for line in document["evaluations"]]
             for line, figures, evaluated in rows:
                 self._add(int(line["env_steps"]), int(line["tick"]), figures, evaluated, metric)
+            for line in document["updates"]:
+                self._add(int(line["env_steps"]), int(line["tick"]), self._shares(line.get("ends", {})), False, metric)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FrameError(f"the course of training cannot be read: {error!r}") from error
         for path in self.curves:
@@ -85,6 +101,14 @@ class Course:
                 continue
             path = evaluation_path(name, metric) if evaluated else training_path(name)
             self.curves.setdefault(path, {})[env_steps] = Point(env_steps, tick, float(value))
+
+    def _shares(self, ends: Mapping[str, int]) -> dict[str, float]:
+        """Percent of the ended trips by end; 0 for one that other updates have. Without a trip there is none."""
+        if not ends:
+            return {}
+        known = {path.rsplit("/", 1)[1] for path in self.curves if path.startswith(ENDS)}
+        shares = dict.fromkeys(known | {"arrival_percent"}, 0.0)
+        return shares | {f"{end}_percent": 100 * count / sum(ends.values()) for end, count in ends.items()}
 
     def _tidy(self, path: str, newest: int | None) -> None:
         """Sorts a curve and bounds it. A learner that continued from a checkpoint makes later points void."""

@@ -37,6 +37,7 @@ class Plot:
 
 PLOTS = (
     Plot("Error over the whole run (m)", f"{course.ROOT}/m", ("train",)),
+    Plot("How trips ended over the whole run (%)", course.ENDS, ("drive",)),
     Plot("Progress over the whole run (m/s)", f"{course.ROOT}/mps", ("drive",)),
     Plot("Beside the route over the whole run (m)", f"{course.ROOT}/m", ("drive",)),
     Plot("Reward over the whole run", f"{course.ROOT}/reward", ("train", "drive")),
@@ -50,7 +51,7 @@ PLOTS = (
 """Every plot, the most important of each mode first."""
 
 
-_SHARED = (f"{course.ROOT}/m", plots.ERRORS, plots.ROAD_USERS)
+_SHARED = (f"{course.ROOT}/m", course.ENDS, plots.ERRORS, plots.ROAD_USERS)
 """Plots with several curves, which need a legend; the title of the others says what they show."""
 
 
