@@ -97,7 +97,7 @@ MODES = (
     Mode(
         "drive",
         ("train", "driving", "--set", "collision.detect=true"),
-        ("learning/percent", "learning/mps", "learning/m", "learning/reward", plots.SPEED),
+        ("learning/ends", "learning/mps", "learning/m", "learning/reward", plots.SPEED),
         (top.GNSS_COLOR, top.ROUTE_COLOR),
     ),
     Mode(

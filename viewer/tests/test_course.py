@@ -11,7 +11,17 @@ import recordings
 import rerun as rr
 
 from caraware_viewer.canvas import Canvas
-from caraware_viewer.course import MAX_POINTS, REWARD, SIGMA, Course, evaluation_path, training_path
+from caraware_viewer.course import (
+    COLORS,
+    MAX_POINTS,
+    REWARD,
+    SIGMA,
+    Course,
+    end_path,
+    evaluation_path,
+    series_name,
+    training_path,
+)
 from caraware_viewer.wire import FrameError
 
 ERROR = training_path("error_m")
@@ -23,7 +33,8 @@ def update(number: int) -> dict[str, Any]:
 
 
 def evaluation(number: int) -> dict[str, Any]:
-    return {"env_steps": 100 * number, "tick": 10 * number, "evaluation": {"ppo": 4.5, "raw_gnss": 7.0}}
+    means = {"ppo": 4.5, "raw_gnss": 7.0}
+    return {"env_steps": 100 * number, "tick": 10 * number, "metric": "error_m", "evaluation": means}
 
 
 def document(updates: list[int], evaluations: list[int] = []) -> bytes:  # noqa: B006
@@ -77,19 +88,33 @@ def test_a_long_run_stays_within_a_bound_and_keeps_its_ends() -> None:
 
 
 def test_trips_are_shown_as_shares_of_those_that_ended() -> None:
-    ends: tuple[dict[str, int], ...] = ({"collision": 3, "arrival": 1}, {}, {"arrival": 4}, {"off_road": 1})
+    # As the trainer names them (caraware.tasks.ends).
+    ends: tuple[dict[str, int], ...] = ({"collision": 3, "arrival": 1}, {}, {"arrival": 4}, {"off-road": 1})
     lines = [update(number) | ({"ends": each} if each else {}) for number, each in enumerate(ends, 1)]
     course = Course()
     course.merge(json.dumps({"updates": lines, "evaluations": []}).encode())
     shares = {
-        name: [(point.env_steps, point.value) for point in course.curves[training_path(f"{name}_percent")].values()]
-        for name in ("arrival", "collision", "off_road")
+        series_name(path): [(point.env_steps, point.value) for point in course.curves[path].values()]
+        for path in map(end_path, ("arrival", "collision", "off-road"))
     }
     assert shares == {
         "arrival": [(100, 25.0), (300, 100.0), (400, 0.0)],
         "collision": [(100, 75.0), (300, 0.0), (400, 0.0)],
-        "off_road": [(400, 100.0)],
+        "off road": [(400, 100.0)],
     }
+    names = ("collision", "off-road", "red light", "against traffic", "arrival", "blocked", "time limit")
+    assert all(end_path(name).rsplit("/", 1)[1] in COLORS for name in names)
+    assert series_name(end_path("end of the run's episode")) == "end of the episode"
+
+
+def test_an_evaluation_is_drawn_in_the_unit_of_its_metric() -> None:
+    course = Course()
+    for number, metric in enumerate(("error_m", "progress_mps", "awareness_percent"), 1):
+        line = evaluation(number) | {"metric": metric}
+        course.merge(json.dumps({"updates": [], "evaluations": [line]}).encode())
+        unit = metric.rsplit("_", 1)[1]
+        assert list(course.curves[evaluation_path("ppo", unit)]) == [100 * number]
+        assert training_path(metric).rsplit("/", 1)[0] == evaluation_path("ppo", unit).rsplit("/", 2)[0]
 
 
 def test_curves_of_one_unit_share_a_view() -> None:

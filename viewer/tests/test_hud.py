@@ -37,6 +37,16 @@ def test_it_has_counts_times_sensors_and_errors() -> None:
         assert part in text, part
 
 
+def test_a_crowd_is_counted_by_the_status_because_a_frame_has_a_sample() -> None:
+    seen = picture()
+    seen.status = {"road_users": {"cav": 10_000, "other": 3, "person": 1}}
+    assert seen.road_users() == {wire.CAV: 10_000, wire.OTHER: 3, wire.PERSON: 1, wire.HERO: 0}
+    assert "10000 CAV" in hud(seen, MAP, [], ViewerFigures())
+    # A status may be half a second old.
+    seen.status = {"road_users": {"cav": 0, "other": 1, "person": 1}}
+    assert sum(seen.road_users().values()) == 3
+
+
 def test_every_sensor_of_the_table_is_counted() -> None:
     sensors = np.array([wire.sensor_bit("ultrasonic") | wire.sensor_bit("gnss"), wire.sensor_bit("gnss")], np.uint32)
     text = hud(picture(sensors=sensors), MAP, [], ViewerFigures())

@@ -283,6 +283,35 @@ def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
     assert [len(row["Points3D:positions"]) for _, row in found[space.CONTACTS].rows] == [1, 1, 0]
 
 
+def of_the_next_episode(tick: int) -> bytes:
+    return frames.header(tick, 3, 0, 0, 3, episode=1) + frames.states(3, tick).tobytes()
+
+
+def test_contacts_of_an_episode_end_with_it(drawn: Drawn) -> None:
+    contact = ("event", frames.event(95, np.array([[1.0, 2.0, 0.0]])))
+    _, found = drawn(contact, ("world", frames.world(96)), ("world", of_the_next_episode(97)))
+    for entity, positions in ((top.CONTACTS, "Points2D:positions"), (space.CONTACTS, "Points3D:positions")):
+        assert [len(row[positions]) for _, row in found[entity].rows] == [1, 0]
+
+
+@pytest.mark.parametrize("last", [of_the_next_episode(2), frames.world(2, 1)], ids=["episode", "departure"])
+def test_points_leave_with_the_vehicle_that_measured_them(last: bytes, drawn: Drawn) -> None:
+    points = {"position_m": [[5, 0, 0], [0, 5, 0]], "tag": [4, 0]}
+    _, found = drawn(
+        ("vehicles", frames.vehicles(0, {101: "x"})),
+        ("world", frames.world(0, 3)),
+        ("pointcloud/x", frames.pointcloud(1, points, id_hash=101)),
+        ("world", last),
+        wanted=["x"],
+    )
+    for entity, what in (
+        (top.CLOUD, "Points2D:positions"),
+        (top.RING, "LineStrips2D:strips"),
+        (space.CLOUD, "Points3D:positions"),
+    ):
+        assert [bool(row[what]) for _, row in found[entity].rows] == [True, False], entity
+
+
 def test_routes_of_heroes_and_their_lights_are_drawn_while_they_are_on_the_road(drawn: Drawn) -> None:
     route = [(0.0, 5.0, wire.NO_SIGNAL, 0), (10.0, 5.0, 4, 1), (20.0, 5.0, wire.NO_SIGNAL, 0)]
     _, found = drawn(

@@ -10,7 +10,7 @@ from caraware_viewer.views import MAX_PLOTS, PLOTS, blueprint, layout_of, mode_o
 ALL = [
     *(
         f"{course.ROOT}/{name}"
-        for name in ("m/error_m", "percent/arrival_percent", "mps/progress_mps", "reward/reward", "sigma/sigma")
+        for name in ("m/error_m", "ends/arrival", "mps/progress_mps", "reward/reward", "sigma/sigma")
     ),
     plots.SPEED,
     plots.GNSS_ERROR,

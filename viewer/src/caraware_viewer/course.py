@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from caraware_viewer.canvas import Canvas
 from caraware_viewer.top import ESTIMATE_COLOR, GNSS_COLOR, PREDICTION_COLOR
@@ -13,7 +15,7 @@ from caraware_viewer.wire import FrameError
 
 ROOT = "learning"
 REWARD, SIGMA = f"{ROOT}/reward/reward", f"{ROOT}/sigma/sigma"
-ENDS = f"{ROOT}/percent"
+ENDS = f"{ROOT}/ends"
 """Root of the shares of trips that ended in one way or another since the update before."""
 MAX_POINTS = 2000
 """Most points of a curve; when more come, every second is dropped."""
@@ -23,13 +25,13 @@ _NAMES = {
     "raw_gnss_error_m": "raw GNSS, training",
     "progress_mps": "progress",
     "route_offset_m": "beside the route",
-    "arrival_percent": "arrived",
-    "collision_percent": "collision",
-    "off_road_percent": "off the road",
-    "red_light_percent": "red light",
-    "against_traffic_percent": "against traffic",
-    "blocked_percent": "blocked",
-    "time_limit_percent": "out of time",
+    "lateral_error_m": "policy, training",
+    "raw_gnss_lateral_error_m": "raw GNSS, training",
+    "wrong_lane_percent": "policy, training",
+    "raw_gnss_wrong_lane_percent": "raw GNSS, training",
+    "awareness_percent": "awareness",
+    "message_kbitps": "messages",
+    "end_of_the_run_s_episode": "end of the episode",
     "reward": "reward",
     "sigma": "σ",
 }
@@ -47,11 +49,19 @@ COLORS: dict[str, list[int]] = {
     "sigma": [120, 200, 255],
     "progress_mps": [150, 230, 150],
     "route_offset_m": [255, 150, 200],
-    "arrival_percent": [150, 230, 150],
-    "collision_percent": [255, 90, 90],
-    "off_road_percent": [255, 170, 60],
-    "red_light_percent": [255, 120, 220],
-    "blocked_percent": [120, 200, 255],
+    "lateral_error_m": PREDICTION_COLOR,
+    "raw_gnss_lateral_error_m": GNSS_COLOR,
+    "wrong_lane_percent": PREDICTION_COLOR,
+    "raw_gnss_wrong_lane_percent": GNSS_COLOR,
+    "awareness_percent": [150, 230, 150],
+    "message_kbitps": [255, 210, 90],
+    "arrival": [150, 230, 150],
+    "collision": [255, 90, 90],
+    "off_road": [255, 170, 60],
+    "red_light": [255, 120, 220],
+    "against_traffic": [190, 130, 255],
+    "blocked": [120, 200, 255],
+    "time_limit": [255, 240, 140],
     "ppo": [255, 255, 255],
     "raw_gnss": [255, 170, 160],
     "supervised": [255, 210, 90],
@@ -79,36 +89,37 @@ class Course:
     _drawn: dict[str, dict[int, Point]] = field(default_factory=dict)
     """Points that are drawn, by path and `env_steps`."""
 
-    def merge(self, payload: bytes, metric: str = "m") -> None:
-        """Adds the points of a document; `metric` is the unit of evaluations. Raises `wire.FrameError`."""
+    def merge(self, payload: bytes) -> None:
+        """Adds the points of a document. Raises `wire.FrameError`."""
         try:
             document = json.loads(payload)
             newest = max((int(line["env_steps"]) for line in document["updates"]), default=None)
-            rows = [(line, line["training"], False) for line in document["updates"]]
-            rows += [(line, line["evaluation"], True) for line in document["evaluations"]]
-            for line, figures, evaluated in rows:
-                self._add(int(line["env_steps"]), int(line["tick"]), figures, evaluated, metric)
             for line in document["updates"]:
-                self._add(int(line["env_steps"]), int(line["tick"]), self._shares(line.get("ends", {})), False, metric)
+                self._add(line, {training_path(name): value for name, value in line["training"].items()})
+                self._add(line, self._shares(line.get("ends", {})))
+            for line in document["evaluations"]:
+                # A line of an older trainer is of the localisation task.
+                unit = _unit(line.get("metric", "error_m"))
+                self._add(line, {evaluation_path(name, unit): value for name, value in line["evaluation"].items()})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FrameError(f"the course of training cannot be read: {error!r}") from error
         for path in self.curves:
             self._tidy(path, newest)
 
-    def _add(self, env_steps: int, tick: int, figures: Mapping[str, float], evaluated: bool, metric: str) -> None:
-        for name, value in figures.items():
-            if not math.isfinite(float(value)):
-                continue
-            path = evaluation_path(name, metric) if evaluated else training_path(name)
-            self.curves.setdefault(path, {})[env_steps] = Point(env_steps, tick, float(value))
+    def _add(self, line: Mapping[str, Any], values: Mapping[str, float]) -> None:
+        """Adds the values of a line by the paths of their curves."""
+        env_steps, tick = int(line["env_steps"]), int(line["tick"])
+        for path, value in values.items():
+            if math.isfinite(float(value)):
+                self.curves.setdefault(path, {})[env_steps] = Point(env_steps, tick, float(value))
 
     def _shares(self, ends: Mapping[str, int]) -> dict[str, float]:
-        """Percent of the ended trips by end; 0 for one that other updates have. Without a trip there is none."""
+        """Percent of the ended trips, by path; 0 for an end that other updates have. Without a trip there is none."""
         if not ends:
             return {}
-        known = {path.rsplit("/", 1)[1] for path in self.curves if path.startswith(ENDS)}
-        shares = dict.fromkeys(known | {"arrival_percent"}, 0.0)
-        return shares | {f"{end}_percent": 100 * count / sum(ends.values()) for end, count in ends.items()}
+        known = {path for path in self.curves if path.startswith(ENDS)} | {end_path("arrival")}
+        shares = {end_path(name): 100 * count / sum(ends.values()) for name, count in ends.items()}
+        return dict.fromkeys(known, 0.0) | shares
 
     def _tidy(self, path: str, newest: int | None) -> None:
         """Sorts a curve and bounds it. A learner that continued from a checkpoint makes later points void."""
@@ -150,9 +161,16 @@ def evaluation_path(estimator: str, metric: str) -> str:
     return f"{ROOT}/{metric}/evaluation/{estimator}"
 
 
+def end_path(name: str) -> str:
+    """Path of the share of trips that ended so: `off-road` is `off_road`, because a path has no blanks."""
+    return f"{ENDS}/{re.sub(r'[^a-z]+', '_', name.lower()).strip('_')}"
+
+
 def series_name(path: str) -> str:
     """Name of a curve in the legend."""
     name = path.rsplit("/", 1)[1]
+    if path.startswith(ENDS):
+        return _NAMES.get(name, name.replace("_", " "))
     if "/evaluation/" in path:
         return f"{_EVALUATED.get(name, name)}, evaluation"
     return _NAMES.get(name, name)

@@ -114,7 +114,7 @@ def _speed(status: RunStatus, training: TrainingStatus) -> str:
 def _counts(picture: Picture, run_map: RunMap) -> str:
     if picture.world is None:
         return _NO_VALUE
-    of_kind = np.bincount(picture.world.states["kind"], minlength=4)
+    of_kind = picture.road_users()
     counts = [(wire.HERO, "heroes"), (wire.CAV, "CAV"), (wire.OTHER, "others"), (wire.PERSON, "pedestrians")]
     parts = [f"{of_kind[kind]} {name}" for kind, name in counts if of_kind[kind] or kind != wire.HERO]
     scene = run_map.get("scene")

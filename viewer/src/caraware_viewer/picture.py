@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caraware_viewer import wire
-from caraware_viewer.documents import RunStatus
+from caraware_viewer.documents import RoadUserCounts, RunStatus
 from caraware_viewer.pairing import Distances
+
+_SAMPLED = 1.05
+"""Road users in the status for each one in a frame, above which the frame has a sample of them."""
 
 
 @dataclass
@@ -67,6 +70,22 @@ class Picture:
         for vehicle in np.unique(frame.rows["vehicle"]):
             points = frame.rows[frame.rows["vehicle"] == vehicle]
             self.routes[int(vehicle)] = points[np.argsort(points["index"])]
+
+    def road_users(self) -> dict[int, int]:
+        """Number of road users by kind. Of a crowd the frame has a sample: then the status counts them all."""
+        counts: dict[int, int] = {}
+        if self.world is not None:
+            kinds = self.world.road_users["kind"]
+            counts = {kind: int((kinds == kind).sum()) for kind in (wire.CAV, wire.OTHER, wire.PERSON, wire.HERO)}
+        users = self.status.get("road_users") or RoadUserCounts()
+        counted = {
+            wire.CAV: users.get("cav", 0),
+            wire.OTHER: users.get("other", 0),
+            wire.PERSON: users.get("person", 0),
+            wire.HERO: users.get("hero", 0),
+        }
+        # The status is up to half a second old, so that a few more or less are no sample.
+        return counted if sum(counted.values()) > _SAMPLED * sum(counts.values()) else counts
 
     def shown_routes(self) -> list[NDArray[np.void]]:
         """Routes of the heroes that are on the road."""

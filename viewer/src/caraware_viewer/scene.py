@@ -119,7 +119,7 @@ class Scene:
         self._course = Course()
         self._region, self._extent_m = region, max(x_max - x_min, y_max - y_min)
         self._detail: Detail | None = None
-        self._routes_drawn = False
+        self._routes_drawn = self._contacts_drawn = False
         self._notes: list[str] = []
         self.display_pid: int | None = None
         """rerun's process, whose memory the HUD shows."""
@@ -236,7 +236,7 @@ class Scene:
         is_new_episode = before is not None and before.header.episode != world.header.episode
         if is_new_episode:
             self._contacts.clear()
-            self._clouds.clear()
+            self._clear_clouds()
             # Its vehicles are counted anew.
             self._picture.neighbours = None
         self._set_tick(world.header)
@@ -245,8 +245,10 @@ class Scene:
         followed = self._picture.followed()
         self._sights.forget_departed(world, self._main, is_new_episode=is_new_episode)
         rows = [row for row in map(self._picture.row, followed) if row is not None]
+        if not set(self._clouds) <= {int(row["id_hash"]) for row in rows}:
+            self._clear_clouds()
         self._detail = detail.choose(world.states, rows[0] if rows else None, self._extent_m, self._region)
-        self._picture.thinned = _left_out(self._detail)
+        self._picture.thinned = _left_out(self._detail, world.header.rows, sum(self._picture.road_users().values()))
         top.draw_road_users(self._canvas, world.states, self._detail, self._picture.names, followed)
         top.draw_followed(self._canvas, rows)
         space.draw_space(self._canvas, world.states, rows[0] if rows else None)
@@ -341,11 +343,13 @@ class Scene:
 
     def _draw_contacts(self, header: wire.Header) -> None:
         oldest = header.tick - _CONTACT_S / float(self._map["tick_s"])
-        if self._contacts:
-            self._contacts = [(tick, at) for tick, at in self._contacts if tick >= oldest]
-            positions_m = np.array([at for _, at in self._contacts]).reshape(-1, 3)
-            top.draw_contacts(self._canvas, positions_m[:, :2])
-            space.draw_contacts(self._canvas, positions_m)
+        self._contacts = [(tick, at) for tick, at in self._contacts if tick >= oldest]
+        if not self._contacts and not self._contacts_drawn:
+            return
+        self._contacts_drawn = bool(self._contacts)
+        positions_m = np.array([at for _, at in self._contacts]).reshape(-1, 3)
+        top.draw_contacts(self._canvas, positions_m[:, :2])
+        space.draw_contacts(self._canvas, positions_m)
 
     def _draw_routes(self, followed: np.void | None) -> None:
         """Draws the routes of the heroes on the road, and the traffic lights that control them."""
@@ -383,6 +387,14 @@ class Scene:
         if followed[0] in placed:
             space.draw_cloud(self._canvas, *placed[followed[0]])
 
+    def _clear_clouds(self) -> None:
+        """Draws no points where some were."""
+        if self._clouds:
+            self._clouds.clear()
+            points_m, colors = np.empty((0, 3), np.float32), np.empty(0, np.uint32)
+            top.draw_clouds(self._canvas, points_m, colors, [])
+            space.draw_cloud(self._canvas, points_m, colors)
+
     def _placed(self, seen: wire.PointCloud) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """World positions and colours of the points to show."""
         points = seen.points if self._lidar == "all" else cloud.points_of_interest(seen.points)
@@ -407,9 +419,9 @@ class Scene:
         self._canvas.set_tick(header.tick, header.episode)
 
 
-def _left_out(chosen: Detail) -> str:
-    """What is left out of a crowd, for the HUD."""
-    parts = []
+def _left_out(chosen: Detail, sent: int, there: int) -> str:
+    """What is left out of a crowd, for the HUD: `sent` of the road users that are `there` are in the frame."""
+    parts = [f"{sent} of {there} road users"] if there > sent else []
     if not chosen.shaped.all():
         parts.append(f"{int(chosen.shaped.sum())} as boxes, the others as dots")
     if chosen.thinned:

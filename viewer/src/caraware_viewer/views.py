@@ -40,6 +40,8 @@ PLOTS = (
     Plot("How trips ended over the whole run (%)", course.ENDS, ("drive",)),
     Plot("Progress over the whole run (m/s)", f"{course.ROOT}/mps", ("drive",)),
     Plot("Beside the route over the whole run (m)", f"{course.ROOT}/m", ("drive",)),
+    Plot("Share over the whole run (%)", f"{course.ROOT}/percent", ("train",)),
+    Plot("Messages over the whole run (kbit/s)", f"{course.ROOT}/kbitps", ("train",)),
     Plot("Reward over the whole run", f"{course.ROOT}/reward", ("train", "drive")),
     Plot("σ of the policy over the whole run", f"{course.ROOT}/sigma", ("train",)),
     Plot("Speed of the followed vehicle (m/s)", plots.SPEED, ("drive", "play", "simulate")),
@@ -51,7 +53,14 @@ PLOTS = (
 """Every plot, the most important of each mode first."""
 
 
-_SHARED = (f"{course.ROOT}/m", course.ENDS, plots.ERRORS, plots.ROAD_USERS)
+_SHARED = (
+    f"{course.ROOT}/m",
+    f"{course.ROOT}/mps",
+    f"{course.ROOT}/percent",
+    course.ENDS,
+    plots.ERRORS,
+    plots.ROAD_USERS,
+)
 """Plots with several curves, which need a legend; the title of the others says what they show."""
 
 

@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import os
+import re
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -214,7 +215,11 @@ class Metrics:
             if metric.name in point.metrics:
                 values[_tag(metric, "training")] = point.metrics[metric.name]
         if ends:
-            values |= {f"trips/{end}_percent": 100 * count / sum(ends.values()) for end, count in ends.items()}
+            # TensorBoard's tags have no blanks.
+            values |= {
+                f"trips/{re.sub(r'[^a-z]+', '_', end)}_percent": 100 * count / sum(ends.values())
+                for end, count in ends.items()
+            }
         values |= {"speed/env_steps_per_s": point.env_steps_per_s, "speed/lag_ticks": lag_ticks}
         self._write(values, point.env_steps)
 
@@ -226,7 +231,8 @@ class Metrics:
         values = {f"{quantity}/evaluation_{suffix}{unit}": mean for suffix, mean in means.items() if mean is not None}
         self._write(values, result.env_steps)
         figures = {name: mean for name in _EVALUATION_TAGS if (mean := result.mean(name)) is not None}
-        self._course.add({"env_steps": result.env_steps, "tick": self._tick, "evaluation": _finite(figures)})
+        line = {"env_steps": result.env_steps, "tick": self._tick, "metric": result.metric}
+        self._course.add(line | {"evaluation": _finite(figures)})
 
     def _write(self, values: Mapping[str, float], env_steps: int) -> None:
         """Add events; those that a full disk does not take are dropped, and later ones go to a new file."""
