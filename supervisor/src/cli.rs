@@ -36,7 +36,7 @@ const AFTER: &str = "Examples:
   caraware generate city --vehicles 20000         write a scenario of any size: city/city.sumocfg
   caraware bench lidar                            measure rays per second, compared with Open3D
   caraware handover town-1                        replace the trainer of a live run; nothing is lost
-  caraware stop                                   end the run; the trainer writes a checkpoint first
+  caraware stop                                   end the run; a trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
 All configuration keys: configs/README.md, or `caraware keys`";
@@ -86,7 +86,7 @@ pub enum Subcommands {
     /// Pause, step or reset a live simulation, switch sensors, place vehicles
     #[command(after_help = CONTROL)]
     Control(ControlArgs),
-    /// End a run in order: the trainer writes a checkpoint and a report
+    /// End a run in order, with a report; a trainer writes a checkpoint first
     Stop {
         /// Name of the run, or its directory; may be left out if only one is alive
         run: Option<String>,

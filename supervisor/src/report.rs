@@ -313,6 +313,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "shortened_logs": housekeeping.shortened_logs,
     });
     report["layout_version"] = json!(LAYOUT_VERSION);
+    report["evaluated_at_env_steps"] = json!(evaluated_at(&report));
     report["earlier_starts"] = json!(resume::earlier_starts(&run.run_dir));
     add_estimators(&mut report, metric, &trainer);
     let path = run.run_dir.join("report.json");
@@ -574,12 +575,15 @@ fn number(report: &Value, key: &str, digits: usize) -> String {
         .map_or("–".into(), |value| format!("{value:.digits$}"))
 }
 
+/// Samples that the policy of the last evaluation had seen.
+fn evaluated_at(report: &Value) -> Option<u64> {
+    let evaluations = report["trainer"]["evaluations"].as_array()?;
+    evaluations.last()?["env_steps"].as_u64()
+}
+
 /// When the last evaluation was, if the run ended before another one: " after 12000 of 40000 samples".
 fn evaluated_before(report: &Value) -> String {
-    let last = report["trainer"]["evaluations"]
-        .as_array()
-        .and_then(|evaluations| evaluations.last()?["env_steps"].as_u64());
-    match (last, report["env_steps"].as_u64()) {
+    match (evaluated_at(report), report["env_steps"].as_u64()) {
         (Some(last), Some(all)) if last < all && report["result"] != "completed" => {
             format!(" after {last} of {all} samples")
         }

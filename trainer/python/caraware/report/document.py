@@ -38,6 +38,7 @@ ROWS = {
     "simulated time (s)": "simulated_s",
     "wall time (s)": "wall_s",
     "environment steps": "env_steps",
+    "environment steps before the evaluation": "evaluated_at_env_steps",
     "environment steps per second": "env_steps_per_s",
     "simulated seconds per wall second": "real_time_factor",
     "restarts": "restarts",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -128,7 +128,7 @@ class RunDirectories:
             mode=str(run.get("mode", "")),
             alive=alive,
             result=report.get("result"),
-            error=f"{metric} {mean:.2f}" if isinstance(mean, float) else None,
+            error=f"{metric} {mean:.2f}{_evaluated_before(report)}" if isinstance(mean, float) else None,
             checkpoint=(directory / "checkpoints" / "latest").is_file(),
             recording=(directory / "recording.mcap").is_file(),
         )
@@ -166,3 +166,10 @@ def _json_lines(path: Path) -> list[dict[str, Any]]:
         except ValueError:
             break
     return found
+
+
+def _evaluated_before(report: Mapping[str, Any]) -> str:
+    """When the last evaluation was, if the run ended before another one."""
+    last, all_steps = report.get("evaluated_at_env_steps"), report.get("env_steps")
+    is_old = isinstance(last, int) and isinstance(all_steps, int) and last < all_steps
+    return f" after {last} of {all_steps} samples" if is_old and report.get("result") != "completed" else ""

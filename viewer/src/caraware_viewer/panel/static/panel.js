@@ -144,7 +144,7 @@ function runState(one) {
 
 function runButtons(one) {
   const found = [];
-  if (one.alive) found.push(button("stop", () => run(["stop", called(one)]), "ends the run with a checkpoint and a report"));
+  if (one.alive) found.push(button("stop", () => run(["stop", called(one)]), "ends the run in order, with a report; a trainer writes a checkpoint first"));
   if (!one.alive && one.mode === "train" && one.result !== "completed") {
     found.push(button("resume", () => run(["train", "--resume", one.name, ...runsOption()]), "continues where it stopped"));
   }
