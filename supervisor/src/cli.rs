@@ -332,6 +332,7 @@ const VIEW: &str = "Examples:
   caraware view town-2                   show one of several runs
   caraware view --vehicle cav.3 --lidar all
   caraware view --camera cav.3@front --radar cav.3
+  caraware view --region 0 0 500 300     a part of a large map, in full detail
   caraware view --messages               what a vehicle knows from V2X messages, and its links
   caraware view tcp/127.0.0.1:7448       connect to an endpoint (`fanout.listen` of a run)
 
@@ -357,6 +358,12 @@ pub struct ViewArgs {
     /// A vehicle to show (repeatable): figures and point cloud; the first is in the 3-D view, with its camera and radar
     #[arg(long, value_name = "ID")]
     pub vehicle: Vec<String>,
+    /// Show the rectangle from X, Y to X, Y alone, in full detail (world metres)
+    #[arg(long, value_names = ["X", "Y", "X", "Y"], num_args = 4, allow_negative_numbers = true)]
+    pub region: Vec<f64>,
+    /// Most frames drawn per second [default: 10]
+    #[arg(long, value_name = "HZ")]
+    pub rate: Option<f64>,
     /// Points of the LIDARs: those on road users, with the range ring (interest); all; or none (off) [default: interest]
     #[arg(long, value_parser = ["interest", "all", "off"])]
     pub lidar: Option<String>,

@@ -40,6 +40,10 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     command.args(args.web_port.map(|port| format!("--web-port={port}")));
     command.args(args.save.as_ref().map(|path| format!("--save={}", path.display())));
     command.args(args.vehicle.iter().map(|id| format!("--vehicle={id}")));
+    if !args.region.is_empty() {
+        command.arg("--region").args(args.region.iter().map(f64::to_string));
+    }
+    command.args(args.rate.map(|rate| format!("--rate={rate}")));
     command.args(args.lidar.as_ref().map(|points| format!("--lidar={points}")));
     command.args(args.camera.iter().map(|name| format!("--camera={name}")));
     command.args(args.radar.iter().map(|name| format!("--radar={name}")));
