@@ -155,6 +155,7 @@ CAV, HERO = rgb(top.KIND_COLORS[0]), rgb(top.KIND_COLORS[3])
 SERIES = {path: color for path, (_, color) in plots.SERIES.items()} | {
     course.training_path(name): course.COLORS[name] for name in course.COLORS if "_" in name or name in course.UNITLESS
 }
+SERIES |= {course.end_path(name): course.COLORS[name] for name in ("arrival", "collision", "off_road", "red_light")}
 
 
 def drawn_in(region: Picture, root: str) -> int:
@@ -291,6 +292,9 @@ def test_a_browser_shows_every_panel_of_a_mode_and_it_moves(mode: Mode, runs: Pa
     keep_picture(second, mode.name)
     if mode.name == "train":
         check_recording(recorded)
+        # A saved run looks as it did live, with a time line below.
+        view = [str(COMMAND), "view", str(recorded), "--web", "--web-port", str(free_port())]
+        wait_for_view(view, tmp_path / "saved.log", lambda picture: missing(picture, mode), "saved")
 
 
 TITLES = {
