@@ -17,7 +17,7 @@ if [ -z "$python" ] || ! "$python" -c 'import sys; sys.exit(sys.version_info < (
 elif ! "$python" -c 'import venv, ensurepip' 2>/dev/null; then
     lacks "the venv module of $python" "apt-get install python3-venv"
 fi
-for pair in libX11.so.6:libx11-6 libXext.so.6:libxext6 libXrender.so.1:libxrender1 libGL.so.1:libgl1; do
+for pair in libX11.so.6:libx11-6 libXext.so.6:libxext6 libXrender.so.1:libxrender1 libatomic.so.1:libatomic1 libexpat.so.1:libexpat1 libz.so.1:zlib1g libGL.so.1:libgl1; do
     library=${pair%%:*}
     if ! { ldconfig -p 2>/dev/null || /sbin/ldconfig -p; } | grep -q "$library"; then
         lacks "the library $library, which SUMO links" "apt-get install ${pair##*:}"

@@ -6,12 +6,15 @@ use ipc_schema::{process::Process, reserve::SHARED_MEMORY};
 
 use crate::{failure::Exit, install::Install, prepare::free_bytes, registry};
 
-/// System libraries that libsumo links, with the Debian package of each.
-const LIBRARIES: [(&str, &str); 4] = [
+/// System libraries that libsumo and SUMO's programs link, with the Debian package of each.
+const LIBRARIES: [(&str, &str); 7] = [
     ("libX11.so.6", "libx11-6"),
     ("libXext.so.6", "libxext6"),
     ("libXrender.so.1", "libxrender1"),
+    ("libatomic.so.1", "libatomic1"),
     ("libGL.so.1", "libgl1"),
+    ("libexpat.so.1", "libexpat1"),
+    ("libz.so.1", "zlib1g"),
 ];
 /// Python packages that training and watching need.
 const PACKAGES: [&str; 10] = [

@@ -8,6 +8,8 @@ use std::{
     time::{Duration, Instant},
 };
 
+use caraware::install::Install;
+
 use crate::common::{Workplace, assert_documented, command_lines, free_port, sumo_program, text, tool};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -484,6 +486,58 @@ fn the_runtime_directory_of_a_killed_run_can_be_removed() {
     assert!(made.is_dir());
     assert!(command(&["doctor", "--clean"]).status().unwrap().success());
     assert!(!made.exists());
+}
+
+/// Libraries of C and C++, which the project's own programs link too.
+const BASE: [&str; 9] = [
+    "ld-linux-x86-64.so.2",
+    "libc.so.6",
+    "libdl.so.2",
+    "libgcc_s.so.1",
+    "libm.so.6",
+    "libpthread.so.0",
+    "libresolv.so.2",
+    "librt.so.1",
+    "libstdc++.so.6",
+];
+
+#[test]
+fn doctor_looks_for_every_library_that_sumo_takes_from_the_system() {
+    let sumo_home = Install::find().unwrap().sumo_home;
+    let wheel = sumo_home.parent().unwrap().join("eclipse_sumo.libs");
+    let files = |directory: &Path| -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(directory).unwrap();
+        entries.map(|entry| entry.unwrap().path()).collect()
+    };
+    let mut brought = files(&sumo_home.join("lib64"));
+    brought.extend(files(&wheel));
+    let own: BTreeSet<String> = brought.iter().map(|path| file_name(path)).collect();
+    let programs = ["netconvert", "netgenerate", "polyconvert"].map(sumo_program);
+    let mut needed = BTreeSet::new();
+    for file in brought.iter().chain(&programs) {
+        let listing = std::process::Command::new("readelf")
+            .arg("-d")
+            .arg(file)
+            .output()
+            .unwrap();
+        let listing = String::from_utf8_lossy(&listing.stdout).into_owned();
+        let names = listing.lines().filter(|line| line.contains("(NEEDED)"));
+        needed.extend(names.filter_map(|line| Some(line.split_once('[')?.1.trim_end_matches(']').to_owned())));
+    }
+    assert!(needed.contains("libc.so.6"), "{needed:?}");
+    let workplace = Workplace::new();
+    let said = text(&workplace.command(&["doctor"]).output().unwrap());
+    for name in &needed {
+        let is_known = own.contains(name) || BASE.contains(&name.as_str());
+        assert!(
+            is_known || said.contains(&format!("library for SUMO: {name}")),
+            "{name}\n{said}"
+        );
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap().to_string_lossy().into_owned()
 }
 
 /// The directory of a run that is being prepared, and the process that prepares it.
