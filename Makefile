@@ -16,7 +16,7 @@ PREFIX ?=
 EXTRAS ?= envs,data,metrics,study
 
 .PHONY: train test build install wheels image programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-trainer test-packages \
-	timed-packages timed-programs with-cuda newcomer model miri deny bench peers peers-metadrive peers-smarts faces puffer site clean
+	timed-packages timed-programs with-cuda newcomer pictures model miri deny bench peers peers-metadrive peers-smarts faces puffer site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -131,6 +131,25 @@ test-packages: programs-and-tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
 	$(VENV)/bin/python -m pytest -q maps/valley/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
+
+# Left out: detector.png needs a trained detector, driving-curves.png runs of eight minutes on sixteen cores, error.png a run of `town`.
+pictures: export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
+pictures: build programs-and-tests browser ## the pictures of README and docs anew: five minutes
+	rm -rf target/pictures
+	mkdir -p target/pictures/sensors
+	$(VENV)/bin/python docs/images/animate_town.py record target/pictures/town
+	$(VENV)/bin/python docs/images/animate_town.py draw target/pictures/town/runs/town-gif
+	CARAWARE_SCREENSHOT=docs/images/viewer.png $(PICTURE) viewer/tests/test_browser.py -k "mode and train"
+	CARAWARE_SCREENSHOT=docs/images/messages.png CARAWARE_SCREENSHOT_MODE=messages $(PICTURE) viewer/tests/test_browser.py -k messages
+	CARAWARE_PANEL_SCREENSHOT=docs/images/panel.png $(PICTURE) viewer/tests/test_panel.py
+	$(VENV)/bin/python docs/images/draw_planes.py
+	$(VENV)/bin/python docs/images/draw_articulated.py
+	target/release/examples/response > target/pictures/response.csv
+	$(VENV)/bin/python docs/images/draw_vehicle_model.py target/pictures/response.csv
+	target/release/examples/sensor_plots target/pictures/sensors
+	$(VENV)/bin/python docs/images/sensor_plots.py target/pictures/sensors
+
+PICTURE = $(VENV)/bin/python -m pytest --quiet
 
 newcomer: build ## every command block of README and docs, also those that the tests only parse: about a quarter of an hour
 	$(VENV)/bin/python scripts/newcomer.py --all
