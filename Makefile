@@ -134,7 +134,7 @@ test-packages: programs-and-tests
 
 # Left out: detector.png needs a trained detector, driving-curves.png runs of eight minutes on sixteen cores, error.png a run of `town`.
 pictures: export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
-pictures: build programs-and-tests browser ## the pictures of README and docs anew: five minutes
+pictures: build programs-and-tests browser ## the pictures of README and docs anew, in a real browser where they show a page
 	rm -rf target/pictures
 	mkdir -p target/pictures/sensors
 	$(VENV)/bin/python docs/images/animate_town.py record target/pictures/town

@@ -12,8 +12,8 @@ from caraware_viewer import wire
 from caraware_viewer.documents import RoadUserCounts, RunStatus
 from caraware_viewer.pairing import Distances
 
-_SAMPLED = 1.05
-"""Road users in the status for each one in a frame, above which the frame has a sample of them."""
+_FULL = 5920
+"""Bodies that fit into a frame of `world` (docs/fanout.md): so many are a sample, unless there are no more."""
 
 
 @dataclass
@@ -73,10 +73,13 @@ class Picture:
 
     def road_users(self) -> dict[int, int]:
         """Number of road users by kind. Of a crowd the frame has a sample: then the status counts them all."""
-        counts: dict[int, int] = {}
-        if self.world is not None:
-            kinds = self.world.road_users["kind"]
-            counts = {kind: int((kinds == kind).sum()) for kind in (wire.CAV, wire.OTHER, wire.PERSON, wire.HERO)}
+        if self.world is None:
+            return {}
+        kinds = self.world.road_users["kind"]
+        counts = {kind: int((kinds == kind).sum()) for kind in (wire.CAV, wire.OTHER, wire.PERSON, wire.HERO)}
+        # The status may be of half a second before, or of the episode before: it counts for a full frame alone.
+        if len(self.world.states) < _FULL:
+            return counts
         users = self.status.get("road_users") or RoadUserCounts()
         counted = {
             wire.CAV: users.get("cav", 0),
@@ -84,8 +87,7 @@ class Picture:
             wire.PERSON: users.get("person", 0),
             wire.HERO: users.get("hero", 0),
         }
-        # The status is up to half a second old, so that a few more or less are no sample.
-        return counted if sum(counted.values()) > _SAMPLED * sum(counts.values()) else counts
+        return max(counted, counts, key=lambda each: sum(each.values()))
 
     def shown_routes(self) -> list[NDArray[np.void]]:
         """Routes of the heroes that are on the road."""
