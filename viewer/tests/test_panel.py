@@ -275,6 +275,45 @@ def test_thirty_actions_in_a_browser_steer_a_live_run(tmp_path: Path) -> None:
     assert len(page.actions) >= LEAST_ACTIONS, page.actions
 
 
+def test_vehicles_of_each_environment_are_shown_and_steered(tmp_path: Path) -> None:
+    line = "caraware train town --envs 2 --name two --set traffic.cavs=4 --set traffic.others=0"
+    line += " --set run.real_time_factor=2 --set episode.ticks=5000"
+    with panel_in(tmp_path) as panel, Browser(*SIZE) as browser:
+        page = PanelPage(browser)
+        browser.open(panel.url)
+        page.wait("document.body.dataset.ready === 'true'")
+        page.type("#own-line", f"{line} --set fanout.listen=tcp/127.0.0.1:{free_port()}")
+        page.click("#own button")
+        page.wait_for_run("two", "alive")
+        choices = "[...document.querySelector('#environment').options].map((one) => one.value).join()"
+        page.wait(f"{choices} === '0,1' && !document.querySelector('#environment-label').hidden")
+        page.wait("window.panelMap.users().length > 0")
+        page.click("#pause")
+        page.wait_for_command("caraware control --run two pause")
+        places = {environment: vehicles_of(page, environment) for environment in ("0", "1")}
+        assert places["0"] != places["1"], "the map shows one environment twice"
+        name = page.browser.evaluate("window.panelMap.users()[0].id")
+        page.choose("#vehicle", name)
+        page.choose("#sensor", "gnss")
+        page.click("#sensor-off")
+        page.wait_for_command(f"caraware control --run two --env 1 sensor {name} gnss off")
+        page.click("#step")
+        page.wait_for_command("caraware control --run two step 10")
+        page.wait("!document.querySelector('#vehicle-state').textContent.includes('gnss')")
+        vehicles_of(page, "0")
+        page.choose("#vehicle", name)
+        page.wait("document.querySelector('#vehicle-state').textContent.includes('gnss')")
+    assert panel.no_run_is_alive()
+
+
+def vehicles_of(page: PanelPage, environment: str) -> list[list[float]]:
+    """Chooses an environment of a paused run; returns the places of its vehicles, m."""
+    page.choose("#environment", environment)
+    page.wait(f"document.querySelector('#map').dataset.environment === '{environment}'")
+    places: list[list[float]] = page.browser.evaluate("window.panelMap.users().map((user) => [user.x_m, user.y_m])")
+    return places
+
+
 def fill_form(page: PanelPage) -> None:
     page.choose("#start-preset", "driving")
     page.wait("document.querySelector('#start-purpose').textContent.startsWith('The driving task')")

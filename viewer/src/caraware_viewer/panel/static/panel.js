@@ -58,6 +58,12 @@ function control(action, onEnd) {
   if (one) run(["control", "--run", called(one), ...action], onEnd);
 }
 
+/** The environment that map and vehicles are of, counted from 0. */
+const environment = () => Number(byId("environment").value || 0);
+
+/** The option that names the environment; none in a run that has one. */
+const ofEnvironment = () => (byId("environment-label").hidden ? [] : ["--env", String(environment())]);
+
 const runOf = (id) => state.runs.find((one) => one.id === id);
 const liveOf = (run) => state.live.find((one) => one.directory === run.id || (one.run === run.name && run.alive));
 
@@ -186,6 +192,7 @@ function choose(id) {
   showMap(null);
   byId("map-status").textContent = "";
   byId("log").textContent = "";
+  setOptions(byId("environment"), []);
   setOptions(byId("vehicle"), []);
   wantedVehicle = null;
   byId("log-line").textContent = "";
@@ -208,6 +215,10 @@ function showRun() {
   for (const element of byId("tabs").children) element.classList.toggle("chosen", element.dataset.tab === tab);
   for (const element of document.querySelectorAll("#tab-control button, #view-start")) element.disabled = !live;
   byId("handover-form").hidden = one.mode !== "train";
+  const environments = (live?.environments ?? []).map((row) => String(row.environment));
+  if (live) setOptions(byId("environment"), environments);
+  byId("environment-label").hidden = environments.length < 2;
+  byId("time").textContent = environments.length < 2 ? "Time" : "Time, in all environments";
   if (tab === "processes") showProcesses(one, live);
 }
 
@@ -312,15 +323,18 @@ const placing = () => document.querySelector("input[name=place]:checked").value;
 async function showRoadUsers() {
   const one = runOf(chosenRun);
   if (!one || !liveOf(one) || tab !== "control") return;
-  if (mapOf !== one.id) {
-    const loaded = await get("/api/map", { run: one.id });
-    if (one.id !== chosenRun) return;
+  const shown = { run: one.id, environment: environment() };
+  const isLeft = () => shown.run !== chosenRun || shown.environment !== environment();
+  if (mapOf !== JSON.stringify(shown)) {
+    const loaded = await get("/api/map", shown);
+    if (isLeft()) return;
     showMap(loaded);
-    mapOf = one.id;
+    mapOf = JSON.stringify(shown);
   }
-  const found = await get("/api/users", { run: one.id });
-  if (one.id !== chosenRun) return;
+  const found = await get("/api/users", shown);
+  if (isLeft()) return;
   users = found.users;
+  byId("map").dataset.environment = shown.environment;
   byId("map-status").textContent = `tick ${found.tick}, episode ${found.episode}, ${users.length} road users`;
   const vehicles = users.filter((user) => user.kind !== "person").map((user) => user.id);
   const order = (a, b) => a.localeCompare(b, "en", { numeric: true });
@@ -351,7 +365,7 @@ function place(edge) {
   if (!id || id === "all") showError("choose one vehicle first");
   else {
     // A vehicle that starts anew has a new id.
-    control([placing(), id, edge], (lines) => {
+    control([...ofEnvironment(), placing(), id, edge], (lines) => {
       wantedVehicle = lines.join("\n").match(/leaves, (\S+) starts/)?.[1] ?? null;
     });
   }
@@ -387,7 +401,7 @@ async function view() {
   const one = runOf(chosenRun);
   const live = one && liveOf(one);
   if (!live || views.has(one.id)) return;
-  const number = await run(["view", called(one), "--web"], () => {
+  const number = await run(["view", called(one), ...ofEnvironment(), "--web"], () => {
     views.delete(one.id);
     showFrame();
   });
@@ -510,9 +524,14 @@ function listen() {
   byId("step").addEventListener("click", () => control(["step", byId("step-ticks").value]));
   byId("reset").addEventListener("click", () => control(["reset"]));
   for (const onOff of ["on", "off"]) {
-    const words = () => ["sensor", byId("vehicle").value, byId("sensor").value, onOff];
+    const words = () => [...ofEnvironment(), "sensor", byId("vehicle").value, byId("sensor").value, onOff];
     byId(`sensor-${onOff}`).addEventListener("click", () => control(words()));
   }
+  byId("environment").addEventListener("change", () => {
+    // Each environment has vehicles of its own, under the same ids.
+    wantedVehicle = null;
+    setOptions(byId("vehicle"), []);
+  });
   byId("vehicle").addEventListener("change", showVehicle);
   listenToMap(placing, (id) => { byId("vehicle").value = id; showVehicle(); }, place);
   byId("handover-key").addEventListener("change", showHandoverKey);
