@@ -92,7 +92,14 @@ private:
         bool gone;
     };
 
+    // The traffic light of a link, by its place in `lights_`, and the number of the link there.
+    struct LitLink {
+        std::int32_t signal;
+        std::uint32_t link;
+    };
+
     const std::string* id_of(std::uint32_t index) const;
+    const LitLink* lit_link(const std::string& from, const std::string& to) const;
     const std::string& known_id(std::uint32_t index) const;
     void note_departures();
     void note_arrivals();
@@ -128,6 +135,8 @@ private:
 
     // In the order of their sorted ids.
     std::vector<Light> lights_;
+    // By the lanes of the link. Read for the first hero: no signal program of an episode has other links than the first.
+    mutable std::map<std::pair<std::string, std::string>, LitLink> lit_links_;
     std::vector<RawSignal> signals_;
     // Place in `live_` of an id; vehicles and persons have separate names. Never iterated.
     std::unordered_map<std::string, std::size_t> vehicle_places_;

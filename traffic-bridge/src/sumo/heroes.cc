@@ -1,6 +1,5 @@
 // Heroes: vehicles that SUMO does not move, and the lanes ahead of them.
 #include <algorithm>
-#include <map>
 #include <stdexcept>
 #include <utility>
 
@@ -34,28 +33,6 @@ void append(LaneShape& shape, const std::string& lane) {
 
 std::uint32_t number_of(const std::string& lane) {
     return static_cast<std::uint32_t>(std::stoul(lane.substr(lane.rfind('_') + 1)));
-}
-
-struct Light {
-    std::int32_t signal;
-    std::uint32_t link;
-};
-
-// The traffic light of each link, by its lanes.
-std::map<std::pair<std::string, std::string>, Light> lights() {
-    std::vector<std::string> ids = engine::TrafficLight::getIDList();
-    std::sort(ids.begin(), ids.end());
-    std::map<std::pair<std::string, std::string>, Light> result;
-    for (std::size_t signal = 0; signal < ids.size(); ++signal) {
-        const auto links = engine::TrafficLight::getControlledLinks(ids[signal]);
-        for (std::size_t link = 0; link < links.size(); ++link) {
-            for (const libsumo::TraCILink& way : links[link]) {
-                result.insert({{way.fromLane, way.toLane},
-                               Light{static_cast<std::int32_t>(signal), static_cast<std::uint32_t>(link)}});
-            }
-        }
-    }
-    return result;
 }
 
 bool is_for_people_alone(const std::string& lane) {
@@ -150,11 +127,26 @@ rust::Vec<RawLane> EngineSimulation::route_lanes(std::uint32_t index) const {
     return result;
 }
 
+const EngineSimulation::LitLink* EngineSimulation::lit_link(const std::string& from, const std::string& to) const {
+    if (lit_links_.empty()) {
+        for (std::size_t signal = 0; signal < lights_.size(); ++signal) {
+            const auto links = engine::TrafficLight::getControlledLinks(lights_[signal].id);
+            for (std::size_t link = 0; link < links.size(); ++link) {
+                for (const libsumo::TraCILink& way : links[link]) {
+                    lit_links_.insert({{way.fromLane, way.toLane},
+                                       LitLink{static_cast<std::int32_t>(signal), static_cast<std::uint32_t>(link)}});
+                }
+            }
+        }
+    }
+    const auto found = lit_links_.find({from, to});
+    return found == lit_links_.end() ? nullptr : &found->second;
+}
+
 rust::Vec<RawWay> EngineSimulation::route_ways(std::uint32_t index) const {
     const std::string& id = known_id(index);
     const std::string species = engine::Vehicle::getVehicleClass(id);
     const std::vector<std::string> route = engine::Vehicle::getRoute(id);
-    const auto lit = lights();
     rust::Vec<RawWay> result;
     for (std::size_t place = 0; place + 1 < route.size(); ++place) {
         for (const std::string& lane : lanes_for(route[place], species)) {
@@ -164,9 +156,9 @@ rust::Vec<RawWay> EngineSimulation::route_ways(std::uint32_t index) const {
                     continue;
                 }
                 RawWay raw = way(static_cast<std::uint32_t>(place), lane, link);
-                if (const auto light = lit.find({lane, link.approachedLane}); light != lit.end()) {
-                    raw.signal = light->second.signal;
-                    raw.link = light->second.link;
+                if (const LitLink* lit = lit_link(lane, link.approachedLane); lit != nullptr) {
+                    raw.signal = lit->signal;
+                    raw.link = lit->link;
                 }
                 result.push_back(std::move(raw));
             }

@@ -122,6 +122,7 @@ void EngineSimulation::start(rust::Slice<const rust::String> arguments, rust::St
     has_elevation_ = net_has_elevation();
     signals_.clear();
     lights_.clear();
+    lit_links_.clear();
     std::vector<std::string> ids = engine::TrafficLight::getIDList();
     std::sort(ids.begin(), ids.end());
     for (std::string& id : ids) {
