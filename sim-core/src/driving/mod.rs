@@ -13,13 +13,15 @@ use ipc_schema::{
 };
 
 pub mod action;
+pub mod bodies;
 pub mod ports;
 pub mod route;
 pub mod surroundings;
 
 use crate::{models::state::ControlInput, scene::Scene};
 use action::HeroAction;
-use route::{HeroRoute, RoutePosition};
+use bodies::TickBody;
+use route::HeroRoute;
 
 /// A hero that is beside the road for this long is off the road, seconds.
 const OFF_ROAD_AFTER_S: f64 = 0.5;
@@ -214,6 +216,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     /// for each hero, in their order) and returns their poses for SUMO.
     pub fn end_tick(&mut self, states: &mut [VehicleState], views: &mut [HeroView]) -> Vec<EgoPose> {
         let mut poses = Vec::new();
+        let bodies: Vec<TickBody> = states.iter().map(TickBody::of).collect();
         let heroes: Vec<usize> = (0..states.len())
             .filter(|&row| states[row].kind == Kind::Hero as u32)
             .collect();
@@ -223,7 +226,7 @@ impl<G: DrivableGround> DrivingTask<G> {
                 states[row].vehicle,
             );
             let station_m = trip.follow(&states[row]);
-            *view = self.view(&trip.route, station_m, row, states);
+            *view = self.view(&trip.route, station_m, row, (states, &bodies));
             let infractions = self.infractions(&mut trip, &states[row], station_m);
             let flags = self.end_flags(&mut trip, &states[row], view, infractions);
             states[row].flags |= flags;
@@ -304,7 +307,13 @@ impl<G: DrivableGround> DrivingTask<G> {
     }
 
     /// The view of the hero in `row` at `station_m` of its route.
-    fn view(&self, route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]) -> HeroView {
+    fn view(
+        &self,
+        route: &HeroRoute,
+        station_m: f64,
+        row: usize,
+        (states, bodies): (&[VehicleState], &[TickBody]),
+    ) -> HeroView {
         let hero = &states[row];
         let (sin, cos) = libm::sincos(hero.yaw_rad);
         let seen = |[x, y]: [f64; 2]| {
@@ -316,7 +325,7 @@ impl<G: DrivableGround> DrivingTask<G> {
         let here = route
             .project([hero.x_m, hero.y_m], station_m, station_m)
             .unwrap_or_default();
-        let (leader_gap_m, leader_speed_mps) = leader(route, station_m, row, states);
+        let (leader_gap_m, leader_speed_mps) = leader(route, station_m, row, (states, bodies));
         HeroView {
             route_m: ROUTE_AHEAD_M.map(|ahead_m| seen(route.at(station_m + ahead_m).unwrap_or(straight(ahead_m)))),
             speed_limit_mps: route.speed_limit_mps(station_m),
@@ -329,6 +338,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             around: surroundings::HeroSurroundings {
                 route,
                 states,
+                bodies,
                 row,
                 station_m,
                 front_station_m,
@@ -366,30 +376,36 @@ impl HeroTrip {
 }
 
 /// Gap to and speed of the next body in the way of the hero in `row`: metres, m/s.
-fn leader(route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]) -> (f64, f64) {
+fn leader(
+    route: &HeroRoute,
+    station_m: f64,
+    row: usize,
+    (states, bodies): (&[VehicleState], &[TickBody]),
+) -> (f64, f64) {
     let hero = &states[row];
     let front_station_m = station_m + front_m(hero);
+    let way = route.window(station_m, front_station_m + SIGHT_M);
     let mut found = (SIGHT_M, 0.0);
-    for (number, other) in states.iter().enumerate() {
-        let reach_m = SIGHT_M + f64::from(hero.length_m + other.length_m);
-        // Its own trailing bodies are behind it.
-        if number == row
-            || is_trailing_body_of(other, hero)
-            || libm::hypot(other.x_m - hero.x_m, other.y_m - hero.y_m) > reach_m
+    for (number, body) in bodies.iter().enumerate() {
+        let room_m = if body.is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
+        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + room_m;
+        let reach_m = SIGHT_M + f64::from(hero.length_m + body.length_m);
+        // Most are beside the way. Its own trailing bodies are behind it.
+        if !way.may_be_within(body.spine_m[1], corridor_m + 0.5 * f64::from(body.length_m))
+            || number == row
+            || is_trailing_body_of(&states[number], hero)
+            || libm::hypot(body.origin_m[0] - hero.x_m, body.origin_m[1] - hero.y_m) > reach_m
         {
             continue;
         }
-        let is_person = other.kind == Kind::Person as u32;
-        let room_m = if is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
-        let corridor_m = 0.5 * f64::from(hero.width_m + other.width_m) + room_m;
-        let in_the_way = spine(other).into_iter().filter_map(|point| {
-            let place = route.project(point, station_m, front_station_m + SIGHT_M)?;
-            (place.left_m.abs() < corridor_m && place.station_m > station_m + 0.5 * front_m(hero)).then_some(place)
+        let in_the_way = body.spine_m.into_iter().filter_map(|point| {
+            let place = way.project_within(point, corridor_m)?;
+            (place.station_m > station_m + 0.5 * front_m(hero)).then_some(place)
         });
         for place in in_the_way {
             let gap_m = (place.station_m - front_station_m).max(0.0);
             if gap_m < found.0 {
-                found = (gap_m, speed_along(other, &place));
+                found = (gap_m, body.speed_along(place.direction));
             }
         }
     }
@@ -401,23 +417,6 @@ fn is_trailing_body_of(body: &VehicleState, vehicle: &VehicleState) -> bool {
     body.kind == Kind::Trailing as u32 && vehicle_of(body.vehicle) == vehicle.vehicle
 }
 
-/// Rear, middle and front of a road user on its centre line.
-fn spine(state: &VehicleState) -> [[f64; 2]; 3] {
-    let rear_m = if state.kind == Kind::Person as u32 {
-        -0.5 * f64::from(state.length_m)
-    } else {
-        -f64::from(state.rear_overhang_m)
-    };
-    [0.0, 0.5, 1.0].map(|share| ahead(state, rear_m + share * f64::from(state.length_m)))
-}
-
-fn speed_along(state: &VehicleState, place: &RoutePosition) -> f64 {
-    let (sin, cos) = libm::sincos(state.yaw_rad);
-    let [forward, left, _] = state.velocity_body_mps.map(f64::from);
-    let (vx, vy) = (cos * forward - sin * left, sin * forward + cos * left);
-    vx * place.direction[0] + vy * place.direction[1]
-}
-
 /// From the rear axle to the front bumper, metres.
 fn front_m(state: &VehicleState) -> f64 {
     f64::from(state.length_m - state.rear_overhang_m)
@@ -426,6 +425,11 @@ fn front_m(state: &VehicleState) -> f64 {
 /// The point `ahead_m` in front of the origin.
 fn ahead(state: &VehicleState, ahead_m: f64) -> [f64; 2] {
     let (sin, cos) = libm::sincos(state.yaw_rad);
+    ahead_by(state, ahead_m, [sin, cos])
+}
+
+/// The same with sine and cosine of its heading.
+fn ahead_by(state: &VehicleState, ahead_m: f64, [sin, cos]: [f64; 2]) -> [f64; 2] {
     [state.x_m + ahead_m * cos, state.y_m + ahead_m * sin]
 }
 

@@ -1,5 +1,7 @@
 //! The line that a hero should follow, by arc length ("station").
 
+use std::ops::Range;
+
 use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RIGHT_OF_WAY, RoutePoint};
 
 /// A traffic light on the route.
@@ -40,6 +42,8 @@ pub struct RoutePosition {
 pub struct HeroRoute {
     points_m: Vec<[f64; 2]>,
     stations_m: Vec<f64>,
+    /// Of each segment, of length one.
+    directions: Vec<[f64; 2]>,
     speed_limits_mps: Vec<f32>,
     stop_lines: Vec<StopLine>,
     crossings: Vec<Crossing>,
@@ -56,6 +60,11 @@ impl HeroRoute {
             (Some(last), Some(station_m)) => station_m + distance_m(*last, here),
             _ => 0.0,
         };
+        if let (Some([ax, ay]), Some(start_m)) = (self.points_m.last(), self.stations_m.last()) {
+            let length_m = station_m - start_m;
+            self.directions
+                .push([(here[0] - ax) / length_m, (here[1] - ay) / length_m]);
+        }
         self.points_m.push(here);
         self.stations_m.push(station_m);
         self.speed_limits_mps.push(point.speed_limit_mps);
@@ -132,35 +141,146 @@ impl HeroRoute {
     /// The position of `point` relative to the part of the route between two stations; `None` if no segment lies there.
     #[must_use]
     pub fn project(&self, point: [f64; 2], from_m: f64, to_m: f64) -> Option<RoutePosition> {
+        self.nearest(self.segments(from_m, to_m), point)
+    }
+
+    /// The part of the route between two stations.
+    #[must_use]
+    pub fn window(&self, from_m: f64, to_m: f64) -> RouteWindow<'_> {
+        let segments = self.segments(from_m, to_m);
+        let points = match segments.is_empty() {
+            true => &[],
+            false => &self.points_m[segments.start..=segments.end],
+        };
+        RouteWindow {
+            route: self,
+            bounds_m: Box2::of(points),
+            segments,
+        }
+    }
+
+    /// Segments between two stations.
+    fn segments(&self, from_m: f64, to_m: f64) -> Range<usize> {
         let first = self.stations_m.partition_point(|end| *end < from_m).saturating_sub(1);
-        let mut nearest: Option<(f64, RoutePosition)> = None;
-        for segment in first..self.points_m.len().saturating_sub(1) {
-            if self.stations_m[segment] > to_m {
-                break;
-            }
-            let (square, place) = self.beside(segment, point);
+        let past = self.stations_m.partition_point(|start| *start <= to_m);
+        first..past.min(self.points_m.len().saturating_sub(1)).max(first)
+    }
+
+    /// The position relative to the nearest of these segments, the first of equally near ones.
+    fn nearest(&self, segments: impl Iterator<Item = usize>, point: [f64; 2]) -> Option<RoutePosition> {
+        let mut nearest: Option<(f64, SegmentPosition)> = None;
+        for segment in segments {
+            let place = self.beside(segment, point);
+            let [dx, dy] = place.offset_m;
+            let square = dx * dx + dy * dy;
             if nearest.is_none_or(|(least, _)| square < least) {
                 nearest = Some((square, place));
             }
         }
-        nearest.map(|(_, place)| place)
-    }
-
-    /// Square of the distance to a segment, and the position relative to it.
-    fn beside(&self, segment: usize, [x, y]: [f64; 2]) -> (f64, RoutePosition) {
-        let ([ax, ay], [bx, by]) = (self.points_m[segment], self.points_m[segment + 1]);
-        let length_m = self.stations_m[segment + 1] - self.stations_m[segment];
-        let [ux, uy] = [(bx - ax) / length_m, (by - ay) / length_m];
-        let along_m = ((x - ax) * ux + (y - ay) * uy).clamp(0.0, length_m);
-        let (dx, dy) = (x - ax - along_m * ux, y - ay - along_m * uy);
-        let square = dx * dx + dy * dy;
+        let (square, place) = nearest?;
+        let ([dx, dy], [ux, uy]) = (place.offset_m, self.directions[place.segment]);
         let side = if ux * dy - uy * dx < 0.0 { -1.0 } else { 1.0 };
-        let place = RoutePosition {
-            station_m: self.stations_m[segment] + along_m,
+        Some(RoutePosition {
+            station_m: self.stations_m[place.segment] + place.along_m,
             left_m: side * square.sqrt(),
             direction: [ux, uy],
+        })
+    }
+
+    /// The place on a segment that is nearest to a point.
+    fn beside(&self, segment: usize, [x, y]: [f64; 2]) -> SegmentPosition {
+        let [ax, ay] = self.points_m[segment];
+        let length_m = self.stations_m[segment + 1] - self.stations_m[segment];
+        let [ux, uy] = self.directions[segment];
+        let along_m = ((x - ax) * ux + (y - ay) * uy).clamp(0.0, length_m);
+        SegmentPosition {
+            segment,
+            along_m,
+            offset_m: [x - ax - along_m * ux, y - ay - along_m * uy],
+        }
+    }
+}
+
+/// A position relative to one segment.
+#[derive(Debug, Clone, Copy)]
+struct SegmentPosition {
+    segment: usize,
+    /// From its beginning to the place nearest to the point, metres.
+    along_m: f64,
+    /// From there to the point, metres.
+    offset_m: [f64; 2],
+}
+
+/// Room beside a rectangle that rounding does not use up, metres.
+const ROUNDING_M: f64 = 1e-6;
+
+/// A rectangle along the axes, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Box2 {
+    min_m: [f64; 2],
+    max_m: [f64; 2],
+}
+
+impl Box2 {
+    /// Around some points.
+    fn of(points_m: &[[f64; 2]]) -> Self {
+        let none = Self {
+            min_m: [f64::INFINITY; 2],
+            max_m: [f64::NEG_INFINITY; 2],
         };
-        (square, place)
+        points_m.iter().fold(none, |all, point| Self {
+            min_m: [0, 1].map(|axis| all.min_m[axis].min(point[axis])),
+            max_m: [0, 1].map(|axis| all.max_m[axis].max(point[axis])),
+        })
+    }
+
+    /// False only if the point is farther than `within_m` from everything in the rectangle.
+    fn may_be_within(&self, [x, y]: [f64; 2], within_m: f64) -> bool {
+        let room_m = within_m + ROUNDING_M;
+        x > self.min_m[0] - room_m
+            && x < self.max_m[0] + room_m
+            && y > self.min_m[1] - room_m
+            && y < self.max_m[1] + room_m
+    }
+}
+
+/// A part of a route, to which many points are compared: most of them are far from it.
+#[derive(Debug, Clone)]
+pub struct RouteWindow<'a> {
+    route: &'a HeroRoute,
+    segments: Range<usize>,
+    bounds_m: Box2,
+}
+
+impl RouteWindow<'_> {
+    /// False only if no point of this part is within `within_m` of `point`.
+    #[must_use]
+    pub fn may_be_within(&self, point: [f64; 2], within_m: f64) -> bool {
+        self.bounds_m.may_be_within(point, within_m)
+            && self
+                .segments
+                .clone()
+                .any(|segment| self.is_near(segment, point, within_m))
+    }
+
+    /// As [`HeroRoute::project`], for a point that is less than `within_m` from this part; `None` for others.
+    #[must_use]
+    pub fn project_within(&self, point: [f64; 2], within_m: f64) -> Option<RoutePosition> {
+        if !self.bounds_m.may_be_within(point, within_m) {
+            return None;
+        }
+        // The segments that are left out are farther than `within_m`.
+        let near = self
+            .segments
+            .clone()
+            .filter(|segment| self.is_near(*segment, point, within_m));
+        self.route
+            .nearest(near, point)
+            .filter(|place| place.left_m.abs() < within_m)
+    }
+
+    fn is_near(&self, segment: usize, point: [f64; 2], within_m: f64) -> bool {
+        Box2::of(&self.route.points_m[segment..segment + 2]).may_be_within(point, within_m)
     }
 }
 
@@ -170,6 +290,8 @@ fn distance_m([ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     /// 100 m east, then 50 m north.
@@ -221,5 +343,25 @@ mod tests {
         assert_eq!((place.station_m, place.left_m), (140.0, -1.0));
         // The second segment begins beyond the window.
         assert_eq!(route.project([101.0, 40.0], 0.0, 99.0).unwrap().station_m, 100.0);
+    }
+
+    proptest! {
+        /// What a window leaves out changes no answer.
+        #[test]
+        fn a_window_answers_as_a_search_of_all_its_segments(
+            points in prop::collection::vec((-60.0..60.0_f64, -60.0..60.0_f64), 2..12),
+            from_m in -10.0..200.0_f64, length_m in 0.0..150.0_f64,
+            point in (-70.0..70.0_f64, -70.0..70.0_f64), within_m in 0.1..30.0_f64,
+        ) {
+            let mut route = HeroRoute::default();
+            for (x_m, y_m) in points {
+                route.push(&RoutePoint { x_m, y_m, ..RoutePoint::default() });
+            }
+            let (point, to_m) = ([point.0, point.1], from_m + length_m);
+            let searched = route.project(point, from_m, to_m).filter(|place| place.left_m.abs() < within_m);
+            let window = route.window(from_m, to_m);
+            prop_assert_eq!(window.project_within(point, within_m), searched);
+            prop_assert!(searched.is_none() || window.may_be_within(point, within_m));
+        }
     }
 }

@@ -3,16 +3,14 @@
 //! All of it is the truth of this tick within [`SENSING_M`]. A rival of a junction is a vehicle that would cross the hero's way there if
 //! it drove straight on at its speed.
 
-use ipc_schema::{
-    traffic::Kind,
-    world::{
-        AROUND, CONFLICT_COLUMNS, LONGEST_GAP_S, PERSON_BESIDE_M, PERSON_COLUMNS, SEEN_CONFLICTS, SEEN_PERSONS,
-        SEEN_SIGNALS, SENSED_USERS, SENSING_M, SIGHT_M, SIGNAL_COLUMNS, USER_COLUMNS, VehicleState,
-    },
+use ipc_schema::world::{
+    AROUND, CONFLICT_COLUMNS, LONGEST_GAP_S, PERSON_BESIDE_M, PERSON_COLUMNS, SEEN_CONFLICTS, SEEN_PERSONS,
+    SEEN_SIGNALS, SENSED_USERS, SENSING_M, SIGHT_M, SIGNAL_COLUMNS, USER_COLUMNS, VehicleState,
 };
 
 use super::{
-    ahead, is_trailing_body_of,
+    bodies::TickBody,
+    is_trailing_body_of,
     route::{Crossing, HeroRoute, StopLine},
 };
 
@@ -34,6 +32,8 @@ pub struct HeroSurroundings<'a> {
     pub route: &'a HeroRoute,
     /// All road users, and the trailing bodies behind them.
     pub states: &'a [VehicleState],
+    /// The same, as all heroes see them.
+    pub bodies: &'a [TickBody],
     /// Its row among them.
     pub row: usize,
     /// Station of its rear axle, metres.
@@ -46,11 +46,8 @@ pub struct HeroSurroundings<'a> {
 #[derive(Debug, Clone, Copy)]
 struct Neighbour<'a> {
     state: &'a VehicleState,
+    body: &'a TickBody,
     square_m2: f64,
-    /// Its middle, world frame, metres.
-    middle_m: [f64; 2],
-    /// Velocity in the world frame, m/s.
-    velocity_mps: [f64; 2],
 }
 
 impl HeroSurroundings<'_> {
@@ -58,14 +55,14 @@ impl HeroSurroundings<'_> {
     #[must_use]
     pub fn numbers(&self, letter: impl Fn(&StopLine) -> Option<u8>) -> [f32; AROUND] {
         let mut numbers = [0.0; AROUND];
-        let near = self.neighbours();
+        let (persons_near, vehicles_near): (Vec<_>, Vec<_>) = self.neighbours().partition(|other| other.body.is_person);
         let (users, rest) = numbers.split_at_mut(SENSED_USERS * USER_COLUMNS);
         let (junctions, rest) = rest.split_at_mut(SEEN_CONFLICTS * CONFLICT_COLUMNS);
         let (lights, persons) = rest.split_at_mut(SEEN_SIGNALS * SIGNAL_COLUMNS);
-        self.write_users(&near, users);
-        self.write_junctions(&near, &letter, junctions);
+        self.write_users(&vehicles_near, users);
+        self.write_junctions(&vehicles_near, &letter, junctions);
         self.write_lights(&letter, lights);
-        self.write_persons(&near, persons);
+        self.write_persons(persons_near, persons);
         numbers
     }
 
@@ -73,65 +70,54 @@ impl HeroSurroundings<'_> {
         &self.states[self.row]
     }
 
-    /// Road users within [`RIVAL_SIGHT_M`], the nearest first; of two at one distance the one in the lower row.
-    fn neighbours(&self) -> Vec<Neighbour<'_>> {
+    /// Road users within [`RIVAL_SIGHT_M`].
+    fn neighbours(&self) -> impl Iterator<Item = Neighbour<'_>> {
         let hero = self.hero();
-        let here = middle(hero);
-        let is_own = |state: &VehicleState| is_trailing_body_of(state, hero);
-        let others = self.states.iter().enumerate();
-        let others = others.filter(|(row, state)| *row != self.row && !is_own(state));
-        let mut near: Vec<Neighbour<'_>> = others
-            .filter(|(_, other)| {
-                let (dx, dy) = (other.x_m - hero.x_m, other.y_m - hero.y_m);
-                dx * dx + dy * dy < RIVAL_SIGHT_M * RIVAL_SIGHT_M
-            })
-            .map(|(_, state)| {
-                let middle_m = middle(state);
-                let (dx, dy) = (middle_m[0] - here[0], middle_m[1] - here[1]);
-                Neighbour {
-                    state,
-                    square_m2: dx * dx + dy * dy,
-                    middle_m,
-                    velocity_mps: velocity(state),
-                }
-            })
-            .collect();
-        near.sort_by(|a, b| a.square_m2.total_cmp(&b.square_m2));
-        near
+        let here = self.bodies[self.row].middle_m;
+        let near = self.bodies.iter().enumerate().filter(|(row, other)| {
+            let (dx, dy) = (other.origin_m[0] - hero.x_m, other.origin_m[1] - hero.y_m);
+            dx * dx + dy * dy < RIVAL_SIGHT_M * RIVAL_SIGHT_M
+                && *row != self.row
+                && !is_trailing_body_of(&self.states[*row], hero)
+        });
+        near.map(move |(row, body)| {
+            let (dx, dy) = (body.middle_m[0] - here[0], body.middle_m[1] - here[1]);
+            Neighbour {
+                state: &self.states[row],
+                body,
+                square_m2: dx * dx + dy * dy,
+            }
+        })
     }
 
-    fn write_users(&self, near: &[Neighbour<'_>], numbers: &mut [f32]) {
+    fn write_users(&self, vehicles: &[Neighbour<'_>], numbers: &mut [f32]) {
         let hero = self.hero();
         let (sin, cos) = libm::sincos(hero.yaw_rad);
         let turned = |[x, y]: [f64; 2]| [cos * x + sin * y, cos * y - sin * x];
-        let mut users = near
-            .iter()
-            .filter(|other| !is_person(other.state) && other.square_m2 <= SENSING_M * SENSING_M);
+        let mut users = nearest_users(vehicles).into_iter().flatten();
         for row in numbers.as_chunks_mut::<USER_COLUMNS>().0 {
             *row = match users.next() {
                 None => [SENSING_M as f32, SENSING_M as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
                 Some(other) => {
-                    let [x, y] = turned([other.middle_m[0] - hero.x_m, other.middle_m[1] - hero.y_m]);
-                    let [forward, left] = turned(other.velocity_mps);
+                    let [x, y] = other.body.middle_m;
+                    let [x, y] = turned([x - hero.x_m, y - hero.y_m]);
+                    let [forward, left] = turned(other.body.velocity_mps);
                     let (sine, cosine) = libm::sincos(other.state.yaw_rad - hero.yaw_rad);
                     let [x, y, cosine, sine, forward, left] =
                         [x, y, cosine, sine, forward, left].map(|value| value as f32);
-                    [
-                        x,
-                        y,
-                        cosine,
-                        sine,
-                        forward,
-                        left,
-                        other.state.length_m,
-                        other.state.width_m,
-                    ]
+                    let (length_m, width_m) = (other.body.length_m, other.body.width_m);
+                    [x, y, cosine, sine, forward, left, length_m, width_m]
                 }
             };
         }
     }
 
-    fn write_junctions(&self, near: &[Neighbour<'_>], letter: &impl Fn(&StopLine) -> Option<u8>, numbers: &mut [f32]) {
+    fn write_junctions(
+        &self,
+        vehicles: &[Neighbour<'_>],
+        letter: &impl Fn(&StopLine) -> Option<u8>,
+        numbers: &mut [f32],
+    ) {
         let crossings = self.route.crossings();
         let first = crossings.partition_point(|crossing| crossing.to_m <= self.front_station_m);
         let mut crossings = crossings[first..]
@@ -146,7 +132,7 @@ impl HeroSurroundings<'_> {
                     [
                         (crossing.from_m - self.front_station_m).max(0.0) as f32,
                         f32::from(u8::from(has_right_of_way)),
-                        self.rival_s(crossing, near) as f32,
+                        self.rival_s(crossing, vehicles) as f32,
                     ]
                 }
             };
@@ -159,7 +145,7 @@ impl HeroSurroundings<'_> {
     }
 
     /// Time until the first rival reaches the hero's way across a junction, driving straight on; at most [`LONGEST_GAP_S`].
-    fn rival_s(&self, crossing: &Crossing, near: &[Neighbour<'_>]) -> f64 {
+    fn rival_s(&self, crossing: &Crossing, vehicles: &[Neighbour<'_>]) -> f64 {
         let mut soonest_s = LONGEST_GAP_S;
         for number in 0..PLACES {
             let share = f64::from(number) / f64::from(PLACES - 1);
@@ -168,16 +154,15 @@ impl HeroSurroundings<'_> {
                 continue;
             };
             let way = [(place[0] - behind[0]) * 2.0, (place[1] - behind[1]) * 2.0];
-            for rival in near.iter().filter(|other| !is_person(other.state)) {
-                let [vx, vy] = rival.velocity_mps;
-                let speed_mps = libm::sqrt(vx * vx + vy * vy);
+            for rival in vehicles.iter().map(|vehicle| vehicle.body) {
+                let ([vx, vy], speed_mps) = (rival.velocity_mps, rival.speed_mps);
                 // What drives along the hero's own way is a leader or a follower.
                 if speed_mps < RIVAL_FROM_MPS || (vx * way[0] + vy * way[1]) > 0.9 * speed_mps {
                     continue;
                 }
                 let (dx, dy) = (place[0] - rival.middle_m[0], place[1] - rival.middle_m[1]);
                 let (along_m, beside_m) = ((dx * vx + dy * vy) / speed_mps, (dx * vy - dy * vx) / speed_mps);
-                let half_m = 0.5 * f64::from(rival.state.length_m);
+                let half_m = 0.5 * f64::from(rival.length_m);
                 if beside_m.abs() < RIVAL_REACH_M && along_m > -half_m {
                     soonest_s = soonest_s.min((along_m - half_m).max(0.0) / speed_mps);
                 }
@@ -206,18 +191,18 @@ impl HeroSurroundings<'_> {
         }
     }
 
-    fn write_persons(&self, near: &[Neighbour<'_>], numbers: &mut [f32]) {
+    fn write_persons(&self, mut near: Vec<Neighbour<'_>>, numbers: &mut [f32]) {
+        near.sort_by(|a, b| a.square_m2.total_cmp(&b.square_m2));
+        let way = self.route.window(self.station_m, self.front_station_m + SENSING_M);
         let mut persons: Vec<[f64; PERSON_COLUMNS]> = near
             .iter()
-            .filter(|other| is_person(other.state))
             .filter_map(|other| {
-                let end_m = self.front_station_m + SENSING_M;
-                let place = self.route.project(other.middle_m, self.station_m, end_m)?;
+                let place = way.project_within(other.body.middle_m, PERSON_BESIDE_M)?;
                 let ahead_m = place.station_m - self.front_station_m;
                 let [dx, dy] = place.direction;
-                let [vx, vy] = other.velocity_mps;
-                let is_beside = ahead_m > 0.0 && ahead_m < SENSING_M && place.left_m.abs() < PERSON_BESIDE_M;
-                is_beside.then_some([ahead_m, place.left_m, dx * vy - dy * vx])
+                let [vx, vy] = other.body.velocity_mps;
+                let is_ahead = ahead_m > 0.0 && ahead_m < SENSING_M;
+                is_ahead.then_some([ahead_m, place.left_m, dx * vy - dy * vx])
             })
             .collect();
         persons.sort_by(|a, b| a[0].total_cmp(&b[0]));
@@ -232,28 +217,25 @@ impl HeroSurroundings<'_> {
     }
 }
 
-fn is_person(state: &VehicleState) -> bool {
-    state.kind == Kind::Person as u32
-}
-
-/// The middle of a road user, world frame, metres.
-fn middle(state: &VehicleState) -> [f64; 2] {
-    if is_person(state) {
-        return [state.x_m, state.y_m];
+/// The nearest vehicles within [`SENSING_M`], the nearest first; of two at one distance the one in the lower row.
+fn nearest_users<'a>(vehicles: &'a [Neighbour<'a>]) -> [Option<&'a Neighbour<'a>>; SENSED_USERS] {
+    let mut nearest = [None; SENSED_USERS];
+    let mut count = 0;
+    for other in vehicles.iter().filter(|other| other.square_m2 <= SENSING_M * SENSING_M) {
+        let is_nearer = |held: &Option<&Neighbour<'_>>| held.is_some_and(|held| held.square_m2 <= other.square_m2);
+        let place = nearest[..count].partition_point(is_nearer);
+        if place < SENSED_USERS {
+            count = (count + 1).min(SENSED_USERS);
+            nearest[place..count].rotate_right(1);
+            nearest[place] = Some(other);
+        }
     }
-    ahead(state, f64::from(0.5 * state.length_m - state.rear_overhang_m))
-}
-
-/// Velocity in the world frame, m/s.
-fn velocity(state: &VehicleState) -> [f64; 2] {
-    let (sin, cos) = libm::sincos(state.yaw_rad);
-    let [forward, left, _] = state.velocity_body_mps.map(f64::from);
-    [cos * forward - sin * left, sin * forward + cos * left]
+    nearest
 }
 
 #[cfg(test)]
 mod tests {
-    use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RoutePoint, YIELDS};
+    use ipc_schema::traffic::{Kind, NO_SIGNAL, ON_EDGE, RoutePoint, YIELDS};
 
     use super::*;
 
@@ -293,9 +275,11 @@ mod tests {
 
     fn seen(states: &[VehicleState], letter: Option<u8>) -> [f32; AROUND] {
         let route = route();
+        let bodies: Vec<TickBody> = states.iter().map(TickBody::of).collect();
         let hero = HeroSurroundings {
             route: &route,
             states,
+            bodies: &bodies,
             row: 0,
             station_m: 58.0,
             front_station_m: 60.0,
@@ -331,6 +315,16 @@ mod tests {
         assert_eq!(rounded(0), [0.0, 10.0, 1.0, 0.0, 8.0, 0.0, 4.0, 2.0]);
         assert_eq!(rounded(8), [30.0, 0.0, 0.0, -1.0, 0.0, -5.0, 4.0, 2.0]);
         assert_eq!(numbers[16], 50.0);
+    }
+
+    #[test]
+    fn of_many_vehicles_the_nearest_are_seen_and_of_two_at_one_distance_the_lower_row_first() {
+        let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
+        let others =
+            [9.0, 4.0, 7.0, 2.0, -2.0, 8.0, 3.0, 6.0, 5.0, 1.0].map(|y_m| user(Kind::Other, [58.0, y_m], 0.0, 0.0));
+        let states: Vec<VehicleState> = std::iter::once(hero).chain(others).collect();
+        let left: Vec<f32> = (0..8).map(|row| seen(&states, None)[row * 8 + 1]).collect();
+        assert_eq!(left, [1.0, 2.0, -2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     }
 
     #[test]
