@@ -279,15 +279,14 @@ impl CoreProcess {
         let resynchronised = self.mirror.resynchronised();
         self.resynchronisations.add(&header, resynchronised, &self.names)?;
         self.guidances.add(&header, self.mirror.guidances(), &self.names)?;
-        let poses = match &mut self.actions {
-            Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
-            None => Vec::new(),
-        };
+        if let Some(actions) = &mut self.actions {
+            // SUMO's next step needs the poses alone: `traffic-bridge` works while the rest of this tick is computed.
+            let poses = actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?;
+            actions.send_poses(&header, &poses)?;
+            actions.write_views(&layout, draft.payload_mut()).map_err(unreadable)?;
+        }
         draft.send()?;
         self.consumers.sent(header.tick);
-        if let Some(actions) = &self.actions {
-            actions.send_poses(&header, &poses)?;
-        }
         self.ticks += 1;
         self.vehicle_steps += count as u64;
         self.report(&header, states);

@@ -2,7 +2,59 @@
 
 use ipc_schema::{traffic::Kind, world::VehicleState};
 
-use super::ahead_by;
+use super::{PERSON_ROOM_M, ahead_by};
+
+/// All road users of a tick, in their rows.
+#[derive(Debug, Clone, Default)]
+pub struct TickBodies {
+    bodies: Vec<TickBody>,
+    /// Their origins side by side: most are only compared by distance.
+    origins_m: Vec<[f64; 2]>,
+    /// Discs that hold each with the room beside it: x and y of the middle, and the radius, metres.
+    discs_m: Vec<[f64; 3]>,
+}
+
+impl TickBodies {
+    /// The bodies of these states.
+    #[must_use]
+    pub fn of(states: &[VehicleState]) -> Self {
+        let bodies: Vec<TickBody> = states.iter().map(TickBody::of).collect();
+        let disc = |body: &TickBody| {
+            let [x_m, y_m] = body.spine_m[1];
+            let half_m = 0.5 * (f64::from(body.length_m) + f64::from(body.width_m));
+            [x_m, y_m, half_m + PERSON_ROOM_M]
+        };
+        Self {
+            origins_m: bodies.iter().map(|body| body.origin_m).collect(),
+            discs_m: bodies.iter().map(disc).collect(),
+            bodies,
+        }
+    }
+
+    /// The body in a row.
+    #[must_use]
+    pub fn body(&self, row: usize) -> &TickBody {
+        &self.bodies[row]
+    }
+
+    /// Rows of the bodies whose origins are nearer than `within_m` to a point, ascending.
+    pub fn near(&self, [x_m, y_m]: [f64; 2], within_m: f64) -> impl Iterator<Item = usize> {
+        let square_m2 = within_m * within_m;
+        let is_near = move |[ox, oy]: &[f64; 2]| {
+            let (dx, dy) = (ox - x_m, oy - y_m);
+            dx * dx + dy * dy < square_m2
+        };
+        let rows = self.origins_m.iter().enumerate();
+        rows.filter(move |(_, origin)| is_near(origin)).map(|(row, _)| row)
+    }
+
+    /// Middle of the disc that holds the body in a row with the room beside it, and its radius, metres. Rows are in their order.
+    pub fn discs(&self) -> impl Iterator<Item = ([f64; 2], f64)> {
+        self.discs_m
+            .iter()
+            .map(|[x_m, y_m, radius_m]| ([*x_m, *y_m], *radius_m))
+    }
+}
 
 /// A road user of a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -20,7 +20,7 @@ pub mod surroundings;
 
 use crate::{models::state::ControlInput, scene::Scene};
 use action::HeroAction;
-use bodies::TickBody;
+use bodies::TickBodies;
 use route::HeroRoute;
 
 /// A hero that is beside the road for this long is off the road, seconds.
@@ -212,28 +212,31 @@ impl<G: DrivableGround> DrivingTask<G> {
         (action::input(trip.action, &self.limits), refusal)
     }
 
-    /// Ends a tick, after all road users have moved and contacts are known: sets the flags of heroes in `states`, fills `views` (one
-    /// for each hero, in their order) and returns their poses for SUMO.
-    pub fn end_tick(&mut self, states: &mut [VehicleState], views: &mut [HeroView]) -> Vec<EgoPose> {
+    /// Ends a tick, after all road users have moved and contacts are known: sets the flags of heroes in `states` and returns their poses
+    /// for SUMO.
+    pub fn end_tick(&mut self, states: &mut [VehicleState]) -> Vec<EgoPose> {
         let mut poses = Vec::new();
-        let bodies: Vec<TickBody> = states.iter().map(TickBody::of).collect();
-        let heroes: Vec<usize> = (0..states.len())
-            .filter(|&row| states[row].kind == Kind::Hero as u32)
-            .collect();
-        for (&row, view) in heroes.iter().zip(views) {
-            let (mut trip, vehicle) = (
-                self.trips.remove(&states[row].vehicle).unwrap_or_default(),
-                states[row].vehicle,
-            );
-            let station_m = trip.follow(&states[row]);
-            *view = self.view(&trip.route, station_m, row, (states, &bodies));
-            let infractions = self.infractions(&mut trip, &states[row], station_m);
-            let flags = self.end_flags(&mut trip, &states[row], view, infractions);
-            states[row].flags |= flags;
-            poses.push(pose(&states[row]));
-            self.trips.insert(vehicle, trip);
+        for state in states.iter_mut().filter(|state| state.kind == Kind::Hero as u32) {
+            let mut trip = self.trips.remove(&state.vehicle).unwrap_or_default();
+            let station_m = trip.follow(state);
+            let infractions = self.infractions(&mut trip, state, station_m);
+            let flags = self.end_flags(&mut trip, state, station_m, infractions);
+            state.flags |= flags;
+            poses.push(pose(state));
+            self.trips.insert(state.vehicle, trip);
         }
         poses
+    }
+
+    /// Fills `views`, one for each hero in their order, after the tick has ended.
+    pub fn write_views(&self, states: &[VehicleState], views: &mut [HeroView]) {
+        let bodies = TickBodies::of(states);
+        let rows = (0..states.len()).filter(|&row| states[row].kind == Kind::Hero as u32);
+        for (row, view) in rows.zip(views) {
+            if let Some(trip) = self.trips.get(&states[row].vehicle) {
+                *view = self.view(&trip.route, trip.station_m.unwrap_or(0.0), row, (states, &bodies));
+            }
+        }
     }
 
     /// Counts the rules that a hero breaks in a tick; their bits, if they end its episode.
@@ -263,7 +266,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     }
 
     /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
-    fn end_flags(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView, infractions: u32) -> u32 {
+    fn end_flags(&mut self, trip: &mut HeroTrip, state: &VehicleState, station_m: f64, infractions: u32) -> u32 {
         let counts = &mut self.counts;
         counts.episodes += u64::from(state.flags & APPEARED != 0);
         let on_road = [0.0, front_m(state)].iter().all(|ahead_m| {
@@ -287,7 +290,10 @@ impl<G: DrivableGround> DrivingTask<G> {
                 BLOCKED,
                 self.blocked_ticks.is_some_and(|limit| trip.standing_ticks >= limit),
             ),
-            (ARRIVED, has_route && f64::from(view.route_left_m) <= ARRIVED_WITHIN_M),
+            (
+                ARRIVED,
+                has_route && f64::from(trip.route.left_m(station_m + front_m(state))) <= ARRIVED_WITHIN_M,
+            ),
         ] {
             flags |= if holds { bit } else { 0 };
         }
@@ -312,7 +318,7 @@ impl<G: DrivableGround> DrivingTask<G> {
         route: &HeroRoute,
         station_m: f64,
         row: usize,
-        (states, bodies): (&[VehicleState], &[TickBody]),
+        (states, bodies): (&[VehicleState], &TickBodies),
     ) -> HeroView {
         let hero = &states[row];
         let (sin, cos) = libm::sincos(hero.yaw_rad);
@@ -330,7 +336,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             route_m: ROUTE_AHEAD_M.map(|ahead_m| seen(route.at(station_m + ahead_m).unwrap_or(straight(ahead_m)))),
             speed_limit_mps: route.speed_limit_mps(station_m),
             route_offset_m: -here.left_m as f32,
-            route_left_m: (route.length_m() - front_station_m).max(0.0) as f32,
+            route_left_m: route.left_m(front_station_m),
             leader_gap_m: leader_gap_m as f32,
             leader_speed_mps: leader_speed_mps as f32,
             signal_gap_m: self.signal_gap_m(route, front_station_m) as f32,
@@ -380,24 +386,30 @@ fn leader(
     route: &HeroRoute,
     station_m: f64,
     row: usize,
-    (states, bodies): (&[VehicleState], &[TickBody]),
+    (states, bodies): (&[VehicleState], &TickBodies),
 ) -> (f64, f64) {
     let hero = &states[row];
     let front_station_m = station_m + front_m(hero);
     let way = route.window(station_m, front_station_m + SIGHT_M);
     let mut found = (SIGHT_M, 0.0);
-    for (number, body) in bodies.iter().enumerate() {
-        let room_m = if body.is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
-        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + room_m;
-        let reach_m = SIGHT_M + f64::from(hero.length_m + body.length_m);
-        // Most are beside the way. Its own trailing bodies are behind it.
-        if !way.may_be_within(body.spine_m[1], corridor_m + 0.5 * f64::from(body.length_m))
+    // The part of the way on which a nearer one would be.
+    let mut nearer = way.clone();
+    let half_width_m = 0.5 * f64::from(hero.width_m);
+    for (number, (middle_m, radius_m)) in bodies.discs().enumerate() {
+        // Most are beside the way, or behind what was found. Its own trailing bodies are behind it.
+        if !nearer.may_be_within(middle_m, radius_m + half_width_m)
             || number == row
             || is_trailing_body_of(&states[number], hero)
-            || libm::hypot(body.origin_m[0] - hero.x_m, body.origin_m[1] - hero.y_m) > reach_m
         {
             continue;
         }
+        let body = bodies.body(number);
+        let reach_m = SIGHT_M + f64::from(hero.length_m + body.length_m);
+        if libm::hypot(body.origin_m[0] - hero.x_m, body.origin_m[1] - hero.y_m) > reach_m {
+            continue;
+        }
+        let room_m = if body.is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
+        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + room_m;
         let in_the_way = body.spine_m.into_iter().filter_map(|point| {
             let place = way.project_within(point, corridor_m)?;
             (place.station_m > station_m + 0.5 * front_m(hero)).then_some(place)
@@ -406,6 +418,7 @@ fn leader(
             let gap_m = (place.station_m - front_station_m).max(0.0);
             if gap_m < found.0 {
                 found = (gap_m, body.speed_along(place.direction));
+                nearer = way.before(front_station_m + gap_m);
             }
         }
     }

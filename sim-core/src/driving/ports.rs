@@ -156,6 +156,14 @@ impl HeroPorts {
     /// # Errors
     /// The payload is too short.
     pub fn end_tick(&mut self, layout: &WorldLayout, payload: &mut [u8]) -> Result<Vec<EgoPose>, BlockError> {
+        Ok(self.driving.end_tick(block::view_mut(payload, layout.states)?))
+    }
+
+    /// Writes what the heroes see into the `world` message of a tick that has ended.
+    ///
+    /// # Errors
+    /// The payload is too short.
+    pub fn write_views(&self, layout: &WorldLayout, payload: &mut [u8]) -> Result<(), BlockError> {
         let [states, views] = block::split_mut(payload, &[layout.states, layout.heroes])?;
         let whole = |section: Section, element: usize| BlockError {
             actual: section.len,
@@ -163,11 +171,12 @@ impl HeroPorts {
             len: section.len,
             element,
         };
-        let states: &mut [VehicleState] =
-            bytemuck::try_cast_slice_mut(states).map_err(|_| whole(layout.states, size_of::<VehicleState>()))?;
+        let states: &[VehicleState] =
+            bytemuck::try_cast_slice(states).map_err(|_| whole(layout.states, size_of::<VehicleState>()))?;
         let views: &mut [HeroView] =
             bytemuck::try_cast_slice_mut(views).map_err(|_| whole(layout.heroes, size_of::<HeroView>()))?;
-        Ok(self.driving.end_tick(states, views))
+        self.driving.write_views(states, views);
+        Ok(())
     }
 
     /// Sends the heroes' poses to `traffic-bridge`, which waits for them after every tick.

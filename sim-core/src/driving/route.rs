@@ -44,6 +44,8 @@ pub struct HeroRoute {
     stations_m: Vec<f64>,
     /// Of each segment, of length one.
     directions: Vec<[f64; 2]>,
+    /// Around each segment.
+    boxes_m: Vec<Box2>,
     speed_limits_mps: Vec<f32>,
     stop_lines: Vec<StopLine>,
     crossings: Vec<Crossing>,
@@ -64,6 +66,7 @@ impl HeroRoute {
             let length_m = station_m - start_m;
             self.directions
                 .push([(here[0] - ax) / length_m, (here[1] - ay) / length_m]);
+            self.boxes_m.push(Box2::of(&[[*ax, *ay], here]));
         }
         self.points_m.push(here);
         self.stations_m.push(station_m);
@@ -96,6 +99,12 @@ impl HeroRoute {
     #[must_use]
     pub fn length_m(&self) -> f64 {
         self.stations_m.last().copied().unwrap_or(0.0)
+    }
+
+    /// Metres from a station to its end.
+    #[must_use]
+    pub fn left_m(&self, station_m: f64) -> f32 {
+        (self.length_m() - station_m).max(0.0) as f32
     }
 
     /// Station at the end of its first edge, metres.
@@ -147,7 +156,10 @@ impl HeroRoute {
     /// The part of the route between two stations.
     #[must_use]
     pub fn window(&self, from_m: f64, to_m: f64) -> RouteWindow<'_> {
-        let segments = self.segments(from_m, to_m);
+        self.window_of(self.segments(from_m, to_m))
+    }
+
+    fn window_of(&self, segments: Range<usize>) -> RouteWindow<'_> {
         let points = match segments.is_empty() {
             true => &[],
             false => &self.points_m[segments.start..=segments.end],
@@ -252,7 +264,15 @@ pub struct RouteWindow<'a> {
     bounds_m: Box2,
 }
 
-impl RouteWindow<'_> {
+impl<'a> RouteWindow<'a> {
+    /// The segments of this part that begin before a station, or less than [`ROUNDING_M`] behind it.
+    #[must_use]
+    pub fn before(&self, station_m: f64) -> Self {
+        let stations_m = &self.route.stations_m[self.segments.clone()];
+        let count = stations_m.partition_point(|start| *start <= station_m + ROUNDING_M);
+        self.route.window_of(self.segments.start..self.segments.start + count)
+    }
+
     /// False only if no point of this part is within `within_m` of `point`.
     #[must_use]
     pub fn may_be_within(&self, point: [f64; 2], within_m: f64) -> bool {
@@ -280,7 +300,7 @@ impl RouteWindow<'_> {
     }
 
     fn is_near(&self, segment: usize, point: [f64; 2], within_m: f64) -> bool {
-        Box2::of(&self.route.points_m[segment..segment + 2]).may_be_within(point, within_m)
+        self.route.boxes_m[segment].may_be_within(point, within_m)
     }
 }
 
@@ -362,6 +382,9 @@ mod tests {
             let window = route.window(from_m, to_m);
             prop_assert_eq!(window.project_within(point, within_m), searched);
             prop_assert!(searched.is_none() || window.may_be_within(point, within_m));
+            if let Some(place) = searched {
+                prop_assert!(window.before(place.station_m).may_be_within(point, within_m));
+            }
         }
     }
 }

@@ -9,7 +9,7 @@ use ipc_schema::world::{
 };
 
 use super::{
-    bodies::TickBody,
+    bodies::{TickBodies, TickBody},
     is_trailing_body_of,
     route::{Crossing, HeroRoute, StopLine},
 };
@@ -33,7 +33,7 @@ pub struct HeroSurroundings<'a> {
     /// All road users, and the trailing bodies behind them.
     pub states: &'a [VehicleState],
     /// The same, as all heroes see them.
-    pub bodies: &'a [TickBody],
+    pub bodies: &'a TickBodies,
     /// Its row among them.
     pub row: usize,
     /// Station of its rear axle, metres.
@@ -73,14 +73,11 @@ impl HeroSurroundings<'_> {
     /// Road users within [`RIVAL_SIGHT_M`].
     fn neighbours(&self) -> impl Iterator<Item = Neighbour<'_>> {
         let hero = self.hero();
-        let here = self.bodies[self.row].middle_m;
-        let near = self.bodies.iter().enumerate().filter(|(row, other)| {
-            let (dx, dy) = (other.origin_m[0] - hero.x_m, other.origin_m[1] - hero.y_m);
-            dx * dx + dy * dy < RIVAL_SIGHT_M * RIVAL_SIGHT_M
-                && *row != self.row
-                && !is_trailing_body_of(&self.states[*row], hero)
-        });
-        near.map(move |(row, body)| {
+        let here = self.bodies.body(self.row).middle_m;
+        let near = self.bodies.near([hero.x_m, hero.y_m], RIVAL_SIGHT_M);
+        let others = near.filter(|row| *row != self.row && !is_trailing_body_of(&self.states[*row], hero));
+        others.map(move |row| {
+            let body = self.bodies.body(row);
             let (dx, dy) = (body.middle_m[0] - here[0], body.middle_m[1] - here[1]);
             Neighbour {
                 state: &self.states[row],
@@ -275,7 +272,7 @@ mod tests {
 
     fn seen(states: &[VehicleState], letter: Option<u8>) -> [f32; AROUND] {
         let route = route();
-        let bodies: Vec<TickBody> = states.iter().map(TickBody::of).collect();
+        let bodies = TickBodies::of(states);
         let hero = HeroSurroundings {
             route: &route,
             states,

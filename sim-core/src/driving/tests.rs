@@ -2,6 +2,7 @@ use ipc_schema::{
     traffic::{NO_SIGNAL, RoutePoint},
     world::{SENSING_M, USER_COLUMNS, trailing_index},
 };
+use proptest::prelude::*;
 
 use super::*;
 
@@ -64,7 +65,8 @@ fn car(vehicle: u32, kind: Kind, x_m: f64, y_m: f64) -> VehicleState {
 
 fn tick(driving: &mut DrivingTask<Strip>, states: &mut [VehicleState]) -> (HeroView, EgoPose) {
     let mut views = [HeroView::default()];
-    let poses = driving.end_tick(states, &mut views);
+    let poses = driving.end_tick(states);
+    driving.write_views(states, &mut views);
     (views[0], poses[0])
 }
 
@@ -239,4 +241,47 @@ fn a_refused_action_is_flagged_counted_reported_once_and_the_last_valid_one_is_h
     driving.apply_action(3, [0.0, 1.0]);
     tick(&mut driving, &mut states);
     assert_eq!((states[0].flags, driving.counts().refused_actions), (0, 3));
+}
+
+/// The leader by a search of the whole way for each point of every road user.
+fn leader_by_search(route: &HeroRoute, station_m: f64, states: &[VehicleState]) -> (f64, f64) {
+    let hero = &states[0];
+    let front_station_m = station_m + front_m(hero);
+    let mut found = (SIGHT_M, 0.0);
+    for body in states[1..].iter().map(bodies::TickBody::of) {
+        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + SIDE_ROOM_M;
+        let places = body
+            .spine_m
+            .map(|point| route.project(point, station_m, front_station_m + SIGHT_M));
+        for place in places.into_iter().flatten() {
+            let gap_m = (place.station_m - front_station_m).max(0.0);
+            let is_in_the_way = place.left_m.abs() < corridor_m && place.station_m > station_m + 0.5 * front_m(hero);
+            if is_in_the_way && gap_m < found.0 {
+                found = (gap_m, body.speed_along(place.direction));
+            }
+        }
+    }
+    found
+}
+
+proptest! {
+    #[test]
+    fn a_leader_is_the_one_that_a_search_of_everything_finds(
+        others in prop::collection::vec((-5.0..95.0_f64, -8.0..65.0_f64, -3.2..3.2_f64), 0..40),
+        station_m in 0.0..60.0_f64,
+    ) {
+        let mut route = HeroRoute::default();
+        for (x_m, y_m) in [(0.0, 0.0), (30.0, 0.0), (38.0, 3.0), (41.0, 11.0), (41.0, 40.0), (90.0, 60.0)] {
+            route.push(&RoutePoint { x_m, y_m, ..RoutePoint::default() });
+        }
+        let [x_m, y_m] = route.at(station_m).unwrap();
+        let mut states = vec![car(0, Kind::Hero, x_m, y_m)];
+        states.extend(others.into_iter().zip(1..).map(|((x_m, y_m, yaw_rad), vehicle)| VehicleState {
+            yaw_rad,
+            ..car(vehicle, Kind::Other, x_m, y_m)
+        }));
+        let bodies = TickBodies::of(&states);
+        let expected = leader_by_search(&route, station_m, &states);
+        prop_assert_eq!(leader(&route, station_m, 0, (&states, &bodies)), expected);
+    }
 }
