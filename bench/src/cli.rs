@@ -32,6 +32,8 @@ pub enum BenchPart {
     V2x,
     /// Driving: a fixed list of held-out trips with a random driver, the script, SUMO's own driver, and a learnt policy (`--policy`)
     Driving,
+    /// Heroes: agent-steps per second of 16, 64 and 256 heroes that a policy drives, and processor time of a tick by process
+    Heroes,
     /// Recording: wall time of a run that is recorded, as a watcher and without loss, compared with the same run alone
     Record,
     /// Watching: wall and processor time of a tick with a recorder beside the run, compared with the same tick of an equal run without

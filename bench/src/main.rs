@@ -10,6 +10,7 @@ mod endurance;
 mod envs;
 mod fanout;
 mod guard;
+mod heroes;
 mod ipc;
 mod lidar;
 mod overhead;
@@ -132,6 +133,7 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
 fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit> {
     match part {
         BenchPart::Driving => driving::measure(options),
+        BenchPart::Heroes => heroes::measure(options),
         BenchPart::Endurance => endurance::measure(options),
         BenchPart::Soak => soak::measure(options),
         BenchPart::Envs => envs::measure(options),

@@ -34,6 +34,7 @@ fn the_help_shows_the_command_and_every_part() {
         "overhead",
         "scale",
         "peers",
+        "heroes",
         "record",
         "watch",
         "v2x",
@@ -71,6 +72,23 @@ fn a_recorder_that_watches_is_measured_beside_equal_runs() {
         }
     }
     assert!(report["figures"]["MB/s of messages"].as_f64().unwrap() > 0.0, "{text}");
+}
+
+/// Heroes drive, and every process of a tick uses processor time.
+#[test]
+fn heroes_that_a_policy_drives_are_measured() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let (code, text) = answer(&["heroes", "--quick", "--json", file.path().to_str().unwrap()]);
+    assert_eq!(code, Some(0), "{text}");
+    let report: serde_json::Value = serde_json::from_reader(file).unwrap();
+    let figure = |what: &str| report["figures"][what].as_f64().unwrap();
+    for policy in ["learnt", "untrained"] {
+        assert!(figure(&format!("{policy}, 16 heroes, agent-steps/s")) > 0.0, "{text}");
+        assert!(
+            figure(&format!("{policy}, 16 heroes, sim-core, CPU µs/tick")) > 0.0,
+            "{text}"
+        );
+    }
 }
 
 /// More radios and collective perception make more of the others known, and cost the channel more.
