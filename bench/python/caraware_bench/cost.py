@@ -30,7 +30,7 @@ class LoopCost:
 
 def cpu_s() -> float:
     """Processor time so far of this process and of its living descendants, seconds; theirs in ticks of the kernel."""
-    return time.process_time() + sum(used_ticks(child) * TICK_S for child in _descendants(os.getpid()))
+    return time.process_time() + sum(_ticks(child) * TICK_S for child in _descendants(os.getpid()))
 
 
 def _descendants(parent: int) -> list[int]:
@@ -45,10 +45,16 @@ def _descendants(parent: int) -> list[int]:
     return found
 
 
-def used_ticks(process: int) -> int:
-    """User and system time of a process in ticks of the kernel; 0 once it has ended."""
+def _ticks(process: int) -> int:
+    """User and system time of a process; 0 once it has ended."""
     try:
         fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
     except OSError:
         return 0
     return int(fields[11]) + int(fields[12])
+
+
+def thread_time_s(process: int) -> float:
+    """Processor time so far of the living threads of a process, to the nanosecond, seconds."""
+    of_threads = (file.read_text().split()[0] for file in Path(f"/proc/{process}/task").glob("*/schedstat"))
+    return sum(int(nanoseconds) for nanoseconds in of_threads) * 1e-9

@@ -19,7 +19,7 @@ from torch import nn
 
 from caraware.driving import trips
 from caraware.envs import CarAwareVectorEnv, Simulation, make
-from caraware_bench.cost import TICK_S, used_ticks
+from caraware_bench.cost import thread_time_s
 
 LEARNT = Path(__file__).parents[3] / "maps" / "town" / "driver.safetensors"
 LAYERS = (128, 128)
@@ -141,7 +141,7 @@ def _drive(env: CarAwareVectorEnv, act: Policy, observation: Rows, ticks: int, s
 def _cpu_s(supervisor: int) -> dict[str, float]:
     """Processor time so far of each process of the run and of this one, seconds."""
     children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
-    named = {Path(f"/proc/{child}/comm").read_text().strip(): used_ticks(int(child)) * TICK_S for child in children}
+    named = {Path(f"/proc/{child}/comm").read_text().strip(): thread_time_s(int(child)) for child in children}
     return {name: named[name] for name in WORKING} | {"learner": time.process_time()}
 
 
