@@ -29,6 +29,12 @@ use crate::{
     scene::{Scene, chart::Chart},
 };
 
+/// From this many heroes on, their poses are sent before what they see is computed: SUMO's next step needs the poses alone.
+///
+/// On two cores `traffic-bridge` and the learner then change cores in every tick, with cold caches. That costs them about a millisecond
+/// together, as much as the views of some hundred heroes take.
+const OVERLAPPED_HEROES: usize = 128;
+
 /// What this process has counted when an episode begins.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct CoreState {
@@ -279,14 +285,24 @@ impl CoreProcess {
         let resynchronised = self.mirror.resynchronised();
         self.resynchronisations.add(&header, resynchronised, &self.names)?;
         self.guidances.add(&header, self.mirror.guidances(), &self.names)?;
-        if let Some(actions) = &mut self.actions {
-            // SUMO's next step needs the poses alone: `traffic-bridge` works while the rest of this tick is computed.
-            let poses = actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?;
-            actions.send_poses(&header, &poses)?;
+        let poses = match &mut self.actions {
+            Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
+            None => Vec::new(),
+        };
+        let overlaps = heroes >= OVERLAPPED_HEROES;
+        if let Some(actions) = &self.actions {
+            if overlaps {
+                actions.send_poses(&header, &poses)?;
+            }
             actions.write_views(&layout, draft.payload_mut()).map_err(unreadable)?;
         }
         draft.send()?;
         self.consumers.sent(header.tick);
+        if let Some(actions) = &self.actions
+            && !overlaps
+        {
+            actions.send_poses(&header, &poses)?;
+        }
         self.ticks += 1;
         self.vehicle_steps += count as u64;
         self.report(&header, states);
