@@ -17,8 +17,9 @@ from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.estimating import Estimating
-from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
+from caraware.fusion.learner import FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop, Recording
+from caraware.fusion.past import Episode
 from caraware.fusion.train import begin, player
 from caraware.ipc.commits import CommitLog
 from caraware.learn.config import ConfigError
@@ -183,7 +184,7 @@ def test_the_raster_finds_what_a_search_of_all_pieces_finds(tmp_path: Path) -> N
 
 
 def test_without_a_map_no_lane_is_found() -> None:
-    match = LaneMap(Pieces(*torch.zeros(6, 0)), (4.0,)).match(*torch.zeros(3, 1, 5))
+    match = LaneMap(Pieces.none(), (4.0,)).match(*torch.zeros(3, 1, 5))
     assert all((column == 0).all() for column in vars(match).values())
 
 

@@ -48,6 +48,7 @@ def lanes_of(track: Track, *, aside_m: float = 0.0) -> Pieces:
         200 * ones,
         200 * ones,
         13.9 * ones,
+        *torch.zeros(7, len(ones)),
     )
 
 

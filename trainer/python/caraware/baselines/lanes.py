@@ -7,7 +7,7 @@ raster over place and heading remembers which piece is nearest, so that a look-u
 import gzip
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,6 +27,8 @@ MOST_CELLS = 4_000_000
 OTHER_HEADING_RAD = math.radians(75.0)
 """A lane that leads this far away from a vehicle's heading is not the one it drives on."""
 NOWHERE = -1
+GIVES_WAY = ("m", "=", "s", "w")
+"""SUMO's states of a way that must give way: minor, right before left, stop, all-way stop."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,27 @@ class Pieces:
     left_m: Tensor
     """From the piece's start to the end of its lane; a junction's lanes end where the junction does."""
     speed_limit_mps: Tensor
+    begun_m: Tensor
+    """From the start of its lane to the piece's start."""
+    slowest_way_mps: Tensor
+    """Speed limit of the slowest way on from the lane's end across the junction; within a junction, the lane's own."""
+    fastest_way_mps: Tensor
+    inside: Tensor
+    """1 for a lane within a junction."""
+    signals: Tensor
+    """1 where signals stand at the lane's end."""
+    gives_way: Tensor
+    """Share of the ways on that must give way to others."""
+    waits: Tensor
+    """1 for a lane within a junction at whose end vehicles wait for others, halfway across."""
 
     def __len__(self) -> int:
         return len(self.x_m)
+
+    @classmethod
+    def none(cls) -> "Pieces":
+        """No lanes."""
+        return cls(*torch.zeros(len(fields(cls)), 0))
 
 
 def read_pieces(net_file: Path, world_origin_m: Sequence[float] = (0.0, 0.0)) -> Pieces:
@@ -51,16 +71,19 @@ def read_pieces(net_file: Path, world_origin_m: Sequence[float] = (0.0, 0.0)) ->
 
     Raises `OSError` or `xml.etree.ElementTree.ParseError` for a file that is no net.
     """
-    rows: list[tuple[float, ...]] = []
+    lanes: dict[str, list[tuple[float, ...]]] = {}
+    ways: dict[str, list[dict[str, str]]] = {}
     with gzip.open(net_file) if net_file.suffix == ".gz" else net_file.open("rb") as stream:
         for _, element in ElementTree.iterparse(stream):
-            if element.tag != "lane":
-                if element.tag == "edge":
-                    element.clear()
-                continue
-            if _for_cars(element):
-                rows += _cut(element)
-    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 6).T
+            if element.tag == "lane" and _for_cars(element):
+                lanes[element.get("id", f"lane {len(lanes)}")] = _cut(element)
+            elif element.tag == "connection":
+                ways.setdefault(f"{element.get('from')}_{element.get('fromLane')}", []).append(dict(element.attrib))
+            elif element.tag == "edge":
+                element.clear()
+    limits_mps = {lane: pieces[0][LIMIT] for lane, pieces in lanes.items() if pieces}
+    rows = [(*piece, *_end(lane, ways.get(lane, []), limits_mps)) for lane, cut in lanes.items() for piece in cut]
+    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(fields(Pieces))).T
     columns[0] -= world_origin_m[0]
     columns[1] -= world_origin_m[1]
     columns = columns.to(torch.float32)
@@ -72,17 +95,47 @@ def _for_cars(lane: ElementTree.Element) -> bool:
     return "passenger" in allowed.split() if allowed else "passenger" not in denied and "all" not in denied
 
 
+LIMIT = 5
+"""Index of the speed limit in what `_cut` returns."""
+
+
 def _cut(lane: ElementTree.Element) -> list[tuple[float, ...]]:
+    """What is known of each piece from its lane alone: the first seven columns of `Pieces`."""
     points = np.array([[float(v) for v in point.split(",")[:2]] for point in lane.get("shape", "").split()])
     ways = np.diff(points, axis=0) if len(points) > 1 else np.zeros((0, 2))
     lengths = np.hypot(*ways.T)
     lefts = np.cumsum(lengths[::-1])[::-1]
     limit = float(lane.get("speed", "13.9"))
     return [
-        (*start, math.atan2(way[1], way[0]), length, left, limit)
+        (*start, math.atan2(way[1], way[0]), length, left, limit, lefts[0] - left)
         for start, way, length, left in zip(points[:-1].tolist(), ways.tolist(), lengths, lefts, strict=True)
         if length > 0
     ]
+
+
+def _end(lane: str, ways: Sequence[dict[str, str]], limits_mps: dict[str, float]) -> tuple[float, ...]:
+    """What is known of the end of a lane: the other columns of `Pieces`.
+
+    SUMO's ids of lanes within a junction begin with a colon. `via` is the lane on which a way crosses the junction.
+    """
+    inside = lane.startswith(":")
+    crossing = [limits_mps[way["via"]] for way in ways if way.get("via") in limits_mps]
+    speeds_mps = crossing or [limits_mps.get(lane, 0.0)]
+    # Cars that may go on; a way within a junction states its right of way at the junction's edge.
+    ends = [way for way in ways if way.get("via") in limits_mps] if not inside else []
+    giving = [way for way in ends if way.get("state") in GIVES_WAY]
+    return (
+        min(speeds_mps),
+        max(speeds_mps),
+        float(inside),
+        float(any("tl" in way for way in ends)),
+        len(giving) / max(len(ends), 1),
+        float(inside and bool(crossing)),
+    )
+
+
+ENDS = 6
+"""Columns that describe the end of a lane."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +150,11 @@ class Match:
     """The lane's heading less the one asked for."""
     to_end_m: Tensor
     """Left of the lane."""
+    from_start_m: Tensor
+    """Since the lane's start."""
     speed_limit_mps: Tensor
+    end: Tensor
+    """Of the lane's end, `[questions, n, ENDS]`: the columns of `Pieces` from `slowest_way_mps` on."""
     found: Tensor
     """1, or 0 where no lane is near; then all others are 0."""
 
@@ -113,7 +170,8 @@ class LaneMap:
     ) -> None:
         """`other_heading_rad`: a lane that leads this far away from the heading is not found."""
         self._other_heading_rad = other_heading_rad
-        self._pieces = pieces if len(pieces) else Pieces(*torch.zeros(6, 1))
+        self._pieces = pieces if len(pieces) else Pieces(*torch.zeros(len(fields(Pieces)), 1))
+        self._table = torch.stack(list(vars(self._pieces).values()), -1)
         low, high = _corners(self._pieces)
         width, height = (high - low).tolist()
         self._cell_m = max(CELL_M, math.sqrt(width * height / MOST_CELLS))
@@ -169,11 +227,10 @@ class LaneMap:
         piece = torch.where(inside, self._nearest[cell], NOWHERE)
         found = (piece >= 0).to(x_m.dtype)
         piece.clamp_min_(0)
-        p = self._pieces
-        lane_rad = p.heading_rad[piece]
+        x0_m, y0_m, lane_rad, length_m, left_m, limit_mps, begun_m, *_ = (row := self._table[piece]).unbind(-1)
         cos, sin = lane_rad.cos(), lane_rad.sin()
-        dx, dy = x_m - p.x_m[piece], y_m - p.y_m[piece]
-        along = torch.minimum((dx * cos + dy * sin).clamp_min_(0), p.length_m[piece])
+        dx, dy = x_m - x0_m, y_m - y0_m
+        along = torch.minimum((dx * cos + dy * sin).clamp_min_(0), length_m)
         dx, dy = along * cos - dx, along * sin - dy
         cos, sin = heading_rad.cos(), heading_rad.sin()
         turned = (lane_rad - heading_rad + math.pi).remainder(2 * math.pi) - math.pi
@@ -181,8 +238,10 @@ class LaneMap:
             found * (dx * cos + dy * sin),
             found * (dy * cos - dx * sin),
             found * turned,
-            found * (p.left_m[piece] - along),
-            found * p.speed_limit_mps[piece],
+            found * (left_m - along),
+            found * (begun_m + along),
+            found * limit_mps,
+            found[..., None] * row[..., -ENDS:],
             found,
         )
 

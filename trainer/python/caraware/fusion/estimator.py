@@ -7,13 +7,14 @@ A GRU sees what is known, in the vehicle's frame, and gives the gains g, r, m, n
 layer starts at zero, which means g = r = 1, m = n = a = 0: the Kalman filter, with its map. So training starts there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from caraware.baselines.lanes import LaneMap, Match, Pieces
+from caraware.baselines.lanes import ENDS, LaneMap, Match, Pieces
 from caraware.fusion.carrier import Carried
 
 NEAR_M_PER_RAD, TURNING_M_PER_RAD = 4.0, 25.0
@@ -21,13 +22,23 @@ NEAR_M_PER_RAD, TURNING_M_PER_RAD = 4.0, 25.0
 this heading."""
 NOSE_M = 3.7
 """From the rear axle to the front of a car: the point that drivers keep on the lane."""
+END_SCALE = torch.tensor([0.1, 0.1, 1.0, 1.0, 1.0, 1.0])
+"""Of the columns of a lane's end: speeds of 10 m/s, and shares."""
 FREE_M = 0.5
 """The unit of the free correction."""
 GAINS = 10
 """Outputs: g, m, n, a and r, each along and across."""
-OWN, GIVEN, LANE = 6, 15, 6
+TO_END_M = (0.0, 1.0, 2.0, 3.5, 5.0, 7.0, 9.0, 12.0, 16.0, 22.0, 30.0)
+FROM_START_M = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0)
+"""Ways to the end of a lane and from its start, nose of the vehicle: the network sees which of them is near. Vehicles
+stop in front of a junction's edge and behind each other there, brake towards it, and speed up behind it."""
+SLOW_MPS = (0.2, 1.0, 4.0)
+"""Speeds at which a network is to see a difference: standing, creeping, turning."""
+OWN, GIVEN, LANE = 6, 15 + len(SLOW_MPS), 6
 """Inputs that depend on the own estimate, that do not, and of each of the four lanes looked up."""
-INPUTS = OWN + GIVEN + 4 * LANE
+PLACE = len(TO_END_M) + len(FROM_START_M) + ENDS
+"""Inputs of the place on each of the two lanes at the nose, and of their ends."""
+INPUTS = OWN + GIVEN + 4 * LANE + 2 * PLACE
 
 
 @dataclass(frozen=True)
@@ -95,6 +106,7 @@ class FusionEstimator:
         self.centre_m = torch.tensor(centre_m, dtype=torch.float32)
         self._lanes = LaneMap(pieces, (NEAR_M_PER_RAD, NEAR_M_PER_RAD, TURNING_M_PER_RAD, TURNING_M_PER_RAD))
         self._ahead_m = torch.tensor([0.0, NOSE_M, 0.0, NOSE_M])[:, None]
+        self._to_end, self._from_start = _Near(TO_END_M), _Near(FROM_START_M)
 
     def begin(self, slots: int) -> State:
         """Nothing known."""
@@ -126,6 +138,7 @@ class FusionEstimator:
                 c.has_imu,
                 c.has_wheel,
                 c.begins,
+                *(torch.exp(-c.speed_mps / slow_mps) for slow_mps in SLOW_MPS),
             ),
             -1,
         )
@@ -171,9 +184,38 @@ class FusionEstimator:
             ),
             1,
         )
-        inputs = torch.cat((own, p.given, _seen(match)), 1).nan_to_num_(0.0, 0.0, 0.0).clamp_(-10.0, 10.0)
+        inputs = (
+            torch.cat((own, p.given, _seen(match), self._places(match)), 1)
+            .nan_to_num_(0.0, 0.0, 0.0)
+            .clamp_(-10.0, 10.0)
+        )
         ways = torch.stack((match.ahead_m, match.left_m), -1)
         return inputs, ways[1], ways[3]
+
+    def _places(self, match: Match) -> Tensor:
+        """Where on its lane the nose is by both measures, and what is at the end `[n, 2 * PLACE]`."""
+        found = match.found[1::2, :, None]
+        seen = torch.cat(
+            (
+                self._to_end(match.to_end_m[1::2]) * found,
+                self._from_start(match.from_start_m[1::2]) * found,
+                match.end[1::2] * END_SCALE,
+            ),
+            -1,
+        )
+        return seen.transpose(0, 1).flatten(1)
+
+
+class _Near:
+    """How near a way is to each of some ways: bells, the wider the longer the way."""
+
+    def __init__(self, middles_m: Sequence[float]) -> None:
+        self._middles_m = torch.tensor(middles_m)
+        self._widths_m = (0.35 * (self._middles_m + 1.0)).clamp(0.6, 4.0)
+
+    def __call__(self, way_m: Tensor) -> Tensor:
+        """`[..., k]` from 0 to 1."""
+        return torch.exp(-(((way_m[..., None] - self._middles_m) / self._widths_m) ** 2))
 
 
 def distance_loss(error_m: Tensor, valid: Tensor) -> Tensor:

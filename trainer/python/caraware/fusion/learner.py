@@ -1,4 +1,4 @@
-"""How the estimator learns: from whole episodes, along the gradient of its mean error through time.
+"""How the estimator learns: from all episodes so far, along the gradient of its mean error through time.
 
 PPO must guess the gradient of a reward from random actions, since it does not know how actions lead to rewards. Here
 that is known: an estimate is a sum of corrections, and the error a function of it. So the gradient is taken through
@@ -6,6 +6,7 @@ the sum and the network's memory (truncated backpropagation through time; R. Wil
 appears in the loss alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -17,12 +18,16 @@ from caraware.baselines.map_ekf import lane_map, world_origin_of_run
 from caraware.baselines.noise import SensorNoise
 from caraware.fusion.carrier import Carried, Carrier
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
+from caraware.fusion.past import Episode, Past
 from caraware.ipc.run_file import RunFile, config_table
 from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.flat import FlatParameters
 from caraware.learn.ppo import NonFiniteLoss
 from caraware.learn.stored import FUSION, OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
+
+WARM_UP_UPDATES = 3
+"""Updates over which the learning rate rises: Adam's first steps are as long as the rate, whatever the gradient."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class FusionConfig:
     def pieces(self, run: RunFile) -> Pieces:
         """The lanes of the run's net; none without a map. Raises `OSError`."""
         if not self.map:
-            return Pieces(*torch.zeros(6, 0))
+            return Pieces.none()
         return read_pieces(Path(run["scene_files"]["net_file"]), world_origin_of_run(run))
 
 
@@ -64,35 +69,13 @@ class FusionStats:
     """What one episode taught."""
 
     loss_m: float
-    """Mean error in the first pass over the episode, pieces starting from the filter's estimate."""
+    """Mean error in the first pass over drawn pieces, each starting from the filter's estimate."""
     last_loss_m: float
     """In the last pass."""
     gradient_norm: float
     learning_rate: float
     steps: int
     """Gradient steps."""
-
-
-@dataclass(frozen=True)
-class Episode:
-    """What one episode was: `T` ticks of `n` slots."""
-
-    table: Tensor
-    """f32 `[T, n, COLUMNS]`."""
-    truth_m: Tensor
-    """f32 `[T, n, 2]`: east and north from the map's centre."""
-    valid: Tensor
-    """f32 `[T, n]`: 1 for rows that count."""
-
-    def pieces(self, ticks: int) -> "Episode":
-        """The same cut into pieces of so many ticks, side by side; the end is filled with rows that do not count."""
-
-        def cut(column: Tensor) -> Tensor:
-            missing = -len(column) % ticks
-            padded = torch.cat((column, column.new_zeros(missing, *column.shape[1:])))
-            return torch.cat(padded.split(ticks), 1)
-
-        return Episode(cut(self.table), cut(self.truth_m), cut(self.valid))
 
 
 class FusionLearner:
@@ -105,8 +88,13 @@ class FusionLearner:
         pieces: Pieces,
         bounds: MapBounds,
         observation_size: int,
+        past: Past | None = None,
     ) -> None:
-        """It reads the raw samples; `observation_size` is that of the run, which a checkpoint must agree with."""
+        """It reads the raw samples; `observation_size` is that of the run, which a checkpoint must agree with.
+
+        Without a `past` there is none yet, and it is in memory alone.
+        """
+        self.past = past or Past()
         self.config, self.fusion, self.observation_size = trainer, fusion, observation_size
         self._pieces = pieces
         self.updates = 0
@@ -127,11 +115,16 @@ class FusionLearner:
         centre_x_m, centre_y_m = self.estimator.centre_m.tolist()
         return Carrier(noise, (centre_x_m, centre_y_m), lane_map(self._pieces) if len(self._pieces) else None)
 
-    def learn(self, episode: Episode, progress: float) -> FusionStats:
-        """Some passes over an episode; `progress` is the share of training that is done. Raises `NonFiniteLoss`."""
-        self.progress, learning_rate = progress, self._learning_rate(progress)
-        pieces = episode.pieces(self.fusion.segment_ticks)
-        log = [self._pass(pieces, learning_rate) for _ in range(self.config.epochs)]
+    def learn(
+        self, episode: Episode, progress: float, stop_requested: Callable[[], bool] = lambda: False
+    ) -> FusionStats:
+        """Some passes over pieces drawn from this episode and all before; `progress` is the share of training done.
+
+        Raises `NonFiniteLoss`, and `OSError` where the episode cannot be kept.
+        """
+        self.progress, learning_rate = progress, self._learning_rate(progress, self.updates + 1)
+        self.past.add(self.updates + 1, episode.pieces(self.fusion.segment_ticks), stop_requested)
+        log = [self._pass(learning_rate) for _ in range(self.config.epochs)]
         self.updates += 1
         steps = sum(len(losses) for losses, _ in log)
         return FusionStats(
@@ -142,17 +135,15 @@ class FusionLearner:
             steps=steps,
         )
 
-    def _pass(self, pieces: Episode, learning_rate: float) -> tuple[list[float], list[float]]:
-        """Once through all pieces, side by side and in a random share of them: losses and gradient norms."""
-        slots = torch.randperm(pieces.table.shape[1], generator=self.random)
-        slots = slots[pieces.valid.sum(0)[slots] > 0]
-        state, losses, norms = self.estimator.begin(len(slots)), [], []
+    def _pass(self, learning_rate: float) -> tuple[list[float], list[float]]:
+        """Once through as many pieces as a batch has, drawn anew, side by side: losses and gradient norms."""
+        pieces = self.past.draw(self.config.batch_size, self.random)
+        state, losses, norms = self.estimator.begin(pieces.table.shape[1]), [], []
         for start in range(0, len(pieces.table), self.fusion.truncation_ticks):
             ticks = slice(start, start + self.fusion.truncation_ticks)
-            table = pieces.table[ticks].index_select(1, slots)
+            table = pieces.table[ticks]
             offset_m, state = self.estimator.unroll(table, state.detached())
-            error_m = Carried.of(table).filter_m + offset_m - pieces.truth_m[ticks].index_select(1, slots)
-            loss = distance_loss(error_m, pieces.valid[ticks].index_select(1, slots))
+            loss = distance_loss(Carried.of(table).filter_m + offset_m - pieces.truth_m[ticks], pieces.valid[ticks])
             self.parameters.gradient.zero_()
             loss.backward()
             losses.append(self._finite("the loss", loss.detach()))
@@ -168,9 +159,10 @@ class FusionLearner:
             raise NonFiniteLoss(what, self.updates + 1)
         return value.item()
 
-    def _learning_rate(self, progress: float) -> float:
+    def _learning_rate(self, progress: float, update: int) -> float:
         first, final = self.config.learning_rate, self.config.learning_rate_final
-        return first if final is None else first + (final - first) * progress
+        rate = first if final is None else first + (final - first) * progress
+        return rate * min(1.0, update / WARM_UP_UPDATES)
 
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
@@ -179,7 +171,7 @@ class FusionLearner:
 
     def schedules(self) -> dict[str, float]:
         """See `StoredLearner.schedules`."""
-        return {"progress": self.progress, "learning_rate": self._learning_rate(self.progress)}
+        return {"progress": self.progress, "learning_rate": self._learning_rate(self.progress, self.updates)}
 
     def tensors(self) -> StoredTensors:
         """See `StoredLearner.tensors`."""

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from caraware.fusion.carrier import Carried
 from caraware.fusion.estimating import Estimating
-from caraware.fusion.learner import Episode, FusionLearner, FusionStats
+from caraware.fusion.learner import FusionLearner, FusionStats
+from caraware.fusion.past import Episode
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn import rewards
 from caraware.learn.ppo import NonFiniteLoss
@@ -43,8 +44,10 @@ class Beginning:
 
     @classmethod
     def load(cls, checkpoint: Path, learner: FusionLearner) -> "Beginning":
-        """Continue `learner` from a checkpoint. Raises `CheckpointError`."""
-        return cls(load_checkpoint(checkpoint, learner), load_history(checkpoint))
+        """Continue `learner` from a checkpoint, with the episodes of its run. Raises `CheckpointError`."""
+        counters = load_checkpoint(checkpoint, learner)
+        learner.past.load(checkpoint.parents[1], counters.updates)
+        return cls(counters, load_history(checkpoint))
 
     def follow(self, continuation: Continuation, learner: FusionLearner) -> "Beginning":
         """Continue where other learners have come since."""
@@ -183,7 +186,7 @@ class FusionLoop:
         """Learn from the episode that ends with this tick."""
         episode, self._recording = self._recording.episode(), Recording()
         try:
-            stats = self._learner.learn(episode, self._config.progress(obs.episode))
+            stats = self._learner.learn(episode, self._config.progress(obs.episode), self._stop_requested)
         except NonFiniteLoss as error:
             error.batch_file = self._config.run_dir / "logs" / f"nonfinite-update-{error.update:06d}.safetensors"
             error.batch_file.parent.mkdir(parents=True, exist_ok=True)
@@ -250,6 +253,7 @@ class FusionLoop:
         self._saved_updates = self._learner.updates
         if position.committed_tick >= 0:
             self._channel.committed(position.committed_tick)
+        self._learner.past.tidy()
         log.info("checkpoint %s, learned up to tick %d", written.name, position.committed_tick)
 
     def _write_part(self) -> None:

@@ -15,6 +15,7 @@ from caraware.fusion.carrier import COLUMNS
 from caraware.fusion.estimating import FusionPlayer
 from caraware.fusion.learner import FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop
+from caraware.fusion.past import FOLDER, Past
 from caraware.ipc.commits import CommitLog
 from caraware.ipc.run_file import RunFile
 from caraware.learn.config import ConfigError
@@ -35,7 +36,7 @@ def begin(run: RunFile, observation_size: int, found: Continuation) -> tuple[Run
             f"`caraware.fusion.train` learns from one environment, the run has {len(config.environments)}",
             "start it without --envs",
         )
-    learner = _learner(run, config, observation_size)
+    learner = _learner(run, config, observation_size, Past(config.run_dir / FOLDER))
     # Before the first checkpoint of the run it is the one that the run begins with.
     checkpoint = found.checkpoint or (None if found.others else config.resume_from)
     beginning = Beginning.load(checkpoint, learner) if checkpoint else Beginning()
@@ -50,11 +51,11 @@ def player(run: RunFile, config: RunConfig, observation_size: int) -> FusionPlay
     return FusionPlayer(learner, learner.carrier(config.sensors))
 
 
-def _learner(run: RunFile, config: RunConfig, observation_size: int) -> FusionLearner:
+def _learner(run: RunFile, config: RunConfig, observation_size: int, past: Past | None = None) -> FusionLearner:
     fusion = FusionConfig.from_run(run)
     if config.sensors is None:
         raise ConfigError("the run file has no sensor tables", "start the trainer through `caraware train fusion`")
-    return FusionLearner(config.trainer, fusion, fusion.pieces(run), config.bounds, observation_size)
+    return FusionLearner(config.trainer, fusion, fusion.pieces(run), config.bounds, observation_size, past)
 
 
 def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
