@@ -37,7 +37,7 @@ class FusionConfig:
     map: bool
     """Whether the estimator has the lanes of the net."""
     segment_ticks: int
-    """The estimator learns from an episode in pieces of so many ticks, side by side."""
+    """The estimator learns from episodes in pieces of so many ticks, side by side."""
     truncation_ticks: int
     """Ticks between two gradient steps; the gradient reaches no further back."""
 
@@ -141,6 +141,8 @@ class FusionLearner:
         state, losses, norms = self.estimator.begin(pieces.table.shape[1]), [], []
         for start in range(0, len(pieces.table), self.fusion.truncation_ticks):
             ticks = slice(start, start + self.fusion.truncation_ticks)
+            if not pieces.valid[ticks].any():
+                continue  # what fills up short episodes
             table = pieces.table[ticks]
             offset_m, state = self.estimator.unroll(table, state.detached())
             loss = distance_loss(Carried.of(table).filter_m + offset_m - pieces.truth_m[ticks], pieces.valid[ticks])
