@@ -88,7 +88,7 @@ def measure(heroes: int, policy: str, ticks: int, warm_up_ticks: int) -> HeroCos
 
 def learnt(simulation: Simulation) -> Policy:
     """The policy that the repository has: encoders of groups, then two layers of 128."""
-    mean = trips.policy(simulation.run)  # type: ignore[arg-type]  # a run file by its type of the envs package
+    mean = trips.policy(simulation.run)
     return lambda rows: mean(SimpleNamespace(observation=torch.from_numpy(rows))).clamp(-1, 1).numpy()  # type: ignore[arg-type]
 
 
