@@ -58,7 +58,10 @@ class StandIn:
         self.token = self.session.liveliness().declare_token(f"{RUN.prefix}/alive")
 
     def put(self, topic: str, payload: bytes) -> None:
-        self.session.put(f"{RUN.prefix}/{topic}", payload, attachment=struct.pack("<QQ", self.sent, time.time_ns()))
+        attachment = struct.pack("<QQ", self.sent, time.time_ns())
+        # Without this a busy machine drops what it cannot send at once, as the fan-out may.
+        block = zenoh.CongestionControl.BLOCK
+        self.session.put(f"{RUN.prefix}/{topic}", payload, attachment=attachment, congestion_control=block)
         self.sent += 1
 
     def publish_until_clouds_are_wanted(self) -> None:
