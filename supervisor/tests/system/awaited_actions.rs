@@ -125,6 +125,55 @@ fn heroes_drive_as_if_nothing_had_happened() {
     );
 }
 
+/// `sim-core` sends the poses of so many heroes before it has computed what they see: it may be killed between the two.
+#[test]
+fn a_crowd_of_heroes_drives_as_if_nothing_had_happened() {
+    let crowd = WaitingWorld {
+        settings: &[
+            "run.envs=1",
+            "traffic.heroes=256",
+            "traffic.max_road_users=320",
+            "trainer.horizon=6000",
+            "trainer.batch_size=3000",
+            "trainer.network=mlp",
+            "trainer.hidden=[16]",
+            "observation.fields=driving",
+            "episode.training_episodes=3",
+        ],
+        ..DRIVING
+    };
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments(&crowd, "whole", &[]));
+    let expected = outcome(&crowd, &workplace, "whole");
+    let steps = expected["env_steps"].as_u64().unwrap();
+    assert!(
+        steps > 330 * 128,
+        "too few heroes were there at once: {steps} steps of 330 ticks"
+    );
+    let mut run = start(
+        &workplace,
+        &arguments(&crowd, "killed", &["run.real_time_factor=3"]),
+        "killed.log",
+    );
+    for updates in [1, 3, 5] {
+        wait_for_checkpoint(&workplace, "killed", updates, &mut run);
+        let victim = until(&mut run, "a process", || {
+            processes(&workplace, "killed", "/sim-core").pop()
+        });
+        kill_process(victim, Signal::KILL).unwrap();
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("killed.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(
+        said.matches("the simulation is made again from tick").count(),
+        3,
+        "{said}"
+    );
+    assert_eq!(outcome(&crowd, &workplace, "killed"), expected);
+    workplace.assert_nothing_left();
+}
+
 #[test]
 fn stations_speak_as_if_nothing_had_happened() {
     let (expected, played) = disturb(&MESSAGES);
