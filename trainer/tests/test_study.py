@@ -1,6 +1,7 @@
 """Recorded ticks are the bytes that were sent, and a reproduced table fails when a figure leaves its interval."""
 
 import json
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from caraware.study.recording import ARRAYS, FOLDER, SCALARS, TENSORS, EpisodeWr
 from caraware.study.regression import Comparison, converged, same_steps
 from caraware.study.reproduce import ExpectedFigure, FiguresError, compare, expected_figures
 from caraware.study.sublane import TRIPS, write_sublane_scenario
-from caraware.study.tables import TABLES, Options, StudyError, Table, town, whole_run
+from caraware.study.tables import ON_SUBLANES, TABLES, Options, StudyError, Table, town, whole_run
 from synthetic_vehicle import VehicleObservation, observations, town_track, vehicle_run
 
 
@@ -177,3 +178,19 @@ def test_drivers_of_the_sublane_scenario_drift_in_their_lanes(tmp_path: Path) ->
     assert trips.count("<trip ") == TRIPS and '":j"' not in trips and '"walk"' not in trips
     write_sublane_scenario(net, types, tmp_path / "again")
     assert (tmp_path / "again" / "trips.rou.xml").read_text() == trips
+
+
+def test_the_estimator_learns_on_sublanes_by_the_settings_of_its_preset() -> None:
+    preset = tomllib.loads((Path(__file__).parents[2] / "configs" / "fusion.toml").read_text())
+    settings = {f"{table}.{key}": value for table, keys in preset.items() for key, value in keys.items()}
+    # What neither changes what is learnt nor what is evaluated in the end.
+    for key in ("episode.evaluation_interval", "trainer.checkpoint_interval"):
+        del settings[key]
+    on_sublanes = dict(text.split("=", 1) for text in ON_SUBLANES)
+
+    def value(text: str) -> object:
+        return tomllib.loads(f"it = {text}")["it"]
+
+    for key, preset_value in settings.items():
+        given = on_sublanes[key]
+        assert (given if isinstance(preset_value, str) else value(given)) == preset_value, key
