@@ -129,7 +129,7 @@ pub fn chosen_slots(header: &MessageHeader, payload: &[u8]) -> Result<Option<Vec
 }
 
 /// Encodes a prediction with the slots of its observation's frame, so that the rows of both stay pairs. Without `chosen` it has all
-/// slots, or its first ones.
+/// slots, or its first ones. The vehicles that actions are for are left out: the observation's frame has them.
 ///
 /// # Errors
 /// As [`encode`].
@@ -139,15 +139,18 @@ pub fn encode_prediction(
     chosen: Option<&[usize]>,
 ) -> Result<EncodedFrame, FrameError> {
     let [_, numbers, estimates] = dimensions(header);
-    encode_slots(header, payload, chosen, |rows| {
+    // What is left out comes last, so that the sections before it stay where they are.
+    let layout_of = |rows: usize| {
         // A filter that runs has an estimate for each slot, so that fewer slots have fewer of them.
-        let layout = PredictionLayout::sized(rows, numbers, estimates.min(rows));
+        let layout = PredictionLayout::sized(rows, numbers, estimates.min(rows), 0);
         (
             layout.named().map(|(_, section)| section).to_vec(),
             layout.shape,
             layout.len,
         )
-    })
+    };
+    let (_, shape, _) = layout_of(header.rows());
+    encode_slots(&MessageHeader { shape, ..*header }, payload, chosen, layout_of)
 }
 
 /// Encodes what road users know from messages, with the slots of the observation's frame. What the policy of the messages task sees and what

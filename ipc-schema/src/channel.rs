@@ -2,7 +2,7 @@
 //! of this crate derive from it (decision 21).
 
 use crate::{
-    config::Config,
+    config::{Config, TaskKind},
     control::{MAX_SWITCHES, SensorSwitchLayout},
     ego::EgoPoseLayout,
     event::CollisionLayout,
@@ -11,7 +11,7 @@ use crate::{
     neighbours::NeighboursLayout,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
-    prediction::{ESTIMATE_COLUMNS, PredictionLayout},
+    prediction::{ACTION_COLUMNS, ESTIMATE_COLUMNS, PredictionLayout},
     process::Process::{self, Recorder, SensorDaemon, SimCore, TrafficBridge, Trainer, V2x},
     radar::{MOST_DETECTIONS, RadarLayout},
     run::RunFile,
@@ -276,7 +276,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
     ChannelSpec {
         channel: Channel::Prediction,
         name: "prediction",
-        payload: "positions or actions, estimates of the filter",
+        payload: "positions or actions, estimates of the filter, vehicles",
         sections: PredictionLayout::SECTIONS,
         dimensions: PredictionLayout::DIMENSIONS,
         producer: Trainer,
@@ -287,7 +287,15 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         window: RunFile::window_ticks,
         topics: &["prediction"],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| PredictionLayout::new(road_users(run), ESTIMATE_COLUMNS, true).len,
+        max_payload: |run| {
+            let slots = road_users(run);
+            let layout = match run.config.task.kind {
+                TaskKind::Driving => PredictionLayout::of_actions(slots, ACTION_COLUMNS),
+                TaskKind::Messages => PredictionLayout::new(slots, run.config.v2x.candidates as usize, false),
+                TaskKind::Localisation | TaskKind::Lane => PredictionLayout::new(slots, ESTIMATE_COLUMNS, true),
+            };
+            layout.len
+        },
         queue_length: |run| windowful(run) + recorded_ahead(run, Channel::Prediction, 2 * window(run)),
         in_hand: |run| two_batches(Channel::Prediction.queue_length(run)),
         is_used: |_| true,
@@ -536,8 +544,8 @@ impl Channel {
         self.required(run).any(|required| required == process)
     }
 
-    /// Subscribers at a time: each required consumer and its successor, the fan-out, a `recorder` that watches, one beside the run
-    /// (`caraware record`), and one spare, which sim-core takes of `observation` in the driving task.
+    /// Subscribers at a time: each required consumer and its successor, the fan-out, a `recorder` that watches, and one beside the run
+    /// (`caraware record`).
     #[must_use]
     pub fn max_subscribers(self) -> usize {
         let required = self.spec().required.len();

@@ -9,7 +9,7 @@
 //! | `observation` | observations, truth, newest samples, slots | sensor-daemon | trainer, recorder |
 //! | `measurement` | as `observation`, for every tick made | sensor-daemon | v2x, recorder |
 //! | `neighbours` | objects known from messages, radios | v2x | trainer, recorder |
-//! | `prediction` | positions or actions, estimates of the filter | trainer | none |
+//! | `prediction` | positions or actions, estimates of the filter, vehicles | trainer | none |
 //! | `ego-pose` | `[EgoPose]` | sim-core | traffic-bridge |
 //! | `event` | `[Collision]` | sim-core | none |
 //! | `pointcloud` | `Scan`, `[LidarPoint]`: one message for each LIDAR and tick | sensor-daemon | none |
@@ -77,4 +77,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 27;
+pub const SCHEMA_VERSION: u32 = 28;

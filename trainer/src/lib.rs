@@ -3,12 +3,13 @@
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
-    sync::{Arc, LazyLock, Mutex, MutexGuard, atomic::AtomicBool},
+    sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError, atomic::AtomicBool},
     time::{Duration, Instant},
 };
 
 use ipc_schema::{
     activity::Awaited,
+    block,
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
@@ -373,8 +374,8 @@ impl Attachment {
         Ok(())
     }
 
-    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions, and
-    /// `sim-core` waits for them. `estimates` is f32 `[n, 2]`, the estimates of the filter.
+    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions, which
+    /// `sim-core` waits for, and the vehicles of the slots go with them. `estimates` is f32 `[n, 2]`, the estimates of the filter.
     #[pyo3(signature = (block, rows, columns, policy_version, estimates=None))]
     fn publish_predictions(
         &self,
@@ -385,7 +386,12 @@ impl Attachment {
         estimates: Option<&[u8]>,
     ) -> PyResult<()> {
         let slots = block.header.rows();
-        let layout = PredictionLayout::new(slots, columns as usize, estimates.is_some());
+        let inner = self.lock()?;
+        let drives = inner.membership.run.config.drives();
+        let layout = match drives {
+            true => PredictionLayout::of_actions(slots, columns as usize),
+            false => PredictionLayout::new(slots, columns as usize, estimates.is_some()),
+        };
         let expected = layout.prediction.len;
         if rows.len() != expected {
             return Err(PyValueError::new_err(format!(
@@ -393,7 +399,6 @@ impl Attachment {
                 rows.len()
             )));
         }
-        let inner = self.lock()?;
         let header = MessageHeader {
             shape: layout.shape,
             policy_version,
@@ -412,10 +417,16 @@ impl Attachment {
             .predictions
             .loan(header, layout.len)
             .map_err(|error| failed(&error))?;
+        let question = block.message.lock().unwrap_or_else(PoisonError::into_inner);
+        let vehicles: &[u8] = match drives {
+            true => block::view(question.payload(), block.layout.vehicle).map_err(|error| failed(&error))?,
+            false => &[],
+        };
         let payload = draft.payload_mut();
         for (section, rows) in [
             (layout.prediction, rows),
             (layout.estimate_m, estimates.unwrap_or_default()),
+            (layout.vehicle, vehicles),
         ] {
             payload[section.offset..section.offset + section.len].copy_from_slice(rows);
         }
@@ -726,10 +737,10 @@ struct ObservationBlock {
     received_ns: u64,
     header: MessageHeader,
     layout: ObservationLayout,
-    /// Address of the payload; valid as long as `_message` lives.
+    /// Address of the payload; valid as long as `message` lives.
     payload_address: usize,
-    /// Keeps the payload from being overwritten. Never locked: a message is Send but not Sync, Python wants both.
-    _message: Mutex<Message>,
+    /// Keeps the payload from being overwritten. Behind a lock because a message is Send but not Sync, and Python wants both.
+    message: Mutex<Message>,
     neighbours: Option<NeighboursBlock>,
     /// Rows, columns and bytes of a pixel of the images in an observation.
     image_shape: Option<[usize; 3]>,
@@ -791,7 +802,7 @@ impl ObservationBlock {
             header,
             layout,
             payload_address,
-            _message: Mutex::new(message),
+            message: Mutex::new(message),
             neighbours: neighbours.map(NeighboursBlock::new).transpose()?,
             image_shape,
             bounds_episode,

@@ -13,6 +13,30 @@ from pathlib import Path
 from typing import Any
 
 CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
+SLOW_DRIVER = """
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from caraware.ipc.channel import Channel
+from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, run_process
+
+
+def drive(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
+    if role.gets_ready and not role.wait_for_turn(SuccessorClaims(task="driving", environments=1)):
+        return
+    channel = Channel(str(run_file))
+    while not (stop.requested or stop.leave_requested):
+        for obs in channel.receive(0.2):
+            time.sleep(0.05)
+            channel.publish_actions(obs, np.zeros((len(obs.valid), 2), np.float32))
+            channel.consumed(obs.tick)
+
+
+sys.exit(run_process(sys.argv[1:], drive))
+"""
 OURS, SCRIPT, OTHER = "caraware.train", "caraware.driving.trips", "caraware.examples.sb3_takeover"
 SETTINGS = {
     "traffic.heroes": 4,
@@ -40,16 +64,19 @@ SETTINGS = {
 class DrivingRun:
     """A run that is paused while its learner is replaced, so that none comes too late."""
 
-    def __init__(self, place: str) -> None:
+    def __init__(self, place: str, changes: dict[str, Any] | None = None) -> None:
+        """A run in a directory; `changes` to the settings."""
         self.directory, self._place = Path(place, "runs", "drive"), place
         self._environment = os.environ | {
             "CARAWARE_RUNTIME_DIR": f"{place}/r",
             "CARAWARE_PYTHON": sys.executable,
             "CARAWARE_DRIVER": "scripted",
+            "PYTHONPATH": os.pathsep.join(filter(None, [place, os.environ.get("PYTHONPATH")])),
         }
-        settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+        settings = SETTINGS | (changes or {})
+        words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
         self.process = subprocess.Popen(
-            [CARAWARE, "train", "driving", "--name", "drive", "--quiet", *settings],
+            [CARAWARE, "train", "driving", "--name", "drive", "--quiet", *words],
             cwd=place,
             env=self._environment,
             stdout=subprocess.PIPE,
@@ -135,3 +162,20 @@ def test_a_driving_run_goes_to_a_script_to_another_learner_and_back() -> None:
     # The other learner had driven on after its last commit: no update can learn from actions that it did not draw.
     assert "were driven by another policy, and are not learnt from" in log
     assert report["dynamics"]["heroes"]["episodes"] >= 8
+
+
+def test_a_successor_that_is_slow_to_answer_again_gets_all_ticks() -> None:
+    """The run is resumed while the successor still answers ticks that the world has gone on from."""
+    with tempfile.TemporaryDirectory(prefix="cw-") as short:
+        Path(short, "slow_driver.py").write_text(SLOW_DRIVER)
+        # No update comes, so that the successor begins at the first tick.
+        run = DrivingRun(short, {"trainer.horizon": 100_000, "trainer.batch_size": 1_000})
+        try:
+            run.until(lambda: bool(run.log()), "a trainer")
+            run.until(lambda: run.tick("trainer") > 40, "ticks before the handover")
+            run.hand_over("slow_driver")
+            resumed_at = run.tick("traffic-bridge")
+            run.until(lambda: run.tick("trainer") > resumed_at + 20, "ticks that the successor drove")
+        finally:
+            run.process.terminate()
+            run.process.wait(60)

@@ -182,13 +182,14 @@ fn a_prediction_has_the_slots_of_its_observation() {
         let kept = chosen.iter().map(|slot| &bytes[from.offset + slot * row..][..row]);
         assert!(kept.eq(body[to.offset..][..to.len].chunks_exact(row)), "{name}");
     }
-    let layout = PredictionLayout::new(10_000, 2, true);
+    let layout = PredictionLayout::sized(10_000, 2, 10_000, 10_000);
     let words: Vec<u64> = (0..layout.len as u64 / 8).collect();
     let predicted = encode_prediction(&header(layout.shape), cast_slice(&words), Some(&chosen)).unwrap();
     let (head, body) = decode(&predicted.bytes).unwrap();
     let short = PredictionLayout::of(&head);
     assert_eq!(head.rows(), chosen.len());
-    let [(_, first), (_, second)] = short.named();
+    let [(_, first), (_, second), (_, vehicle)] = short.named();
+    assert_eq!(vehicle.len, 0, "the observation's frame has the vehicles");
     for (section, begin) in [(first, 0), (second, layout.named()[1].1.offset / 8)] {
         let rows: Vec<u64> = body[section.offset..][..section.len]
             .chunks_exact(8)

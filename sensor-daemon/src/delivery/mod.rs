@@ -131,14 +131,6 @@ impl Delivery {
             }
     }
 
-    /// True if a tick that is made again has to be sent although the trainer has it: in the driving task `sim-core` reads in the
-    /// observation which hero each action of the trainer's newest answer is for.
-    #[must_use]
-    pub fn shows_again(&self, tick: u64) -> bool {
-        let progress = self.board.progress();
-        !self.makes_ahead && self.is_trainer_ahead(&progress) && tick + 1 >= progress.received_ticks
-    }
-
     /// Updates the state of a planned handover; the simulation has waited for a trainer since `since`.
     pub fn update_handover(&mut self, since: Instant) {
         let under_way = self.makes_ahead && self.board.is_handing_over();

@@ -38,8 +38,6 @@ pub struct TickPublisher {
     others: RequiredConsumers,
     /// Ticks below this are in the checkpoint: they are made again but not sent.
     committed_ticks: u64,
-    /// The trainer's next answer may be to the newest committed tick, which `sim-core` needs then, as in [`Delivery::shows_again`].
-    shows_committed: bool,
     /// The oldest tick of the journal, as the board has it.
     journal_first: u64,
     /// The board has the oldest tick of this journal.
@@ -63,7 +61,6 @@ impl TickPublisher {
             trainer,
             others: membership.consumers(others, channel)?,
             committed_ticks: membership.run.committed_ticks(),
-            shows_committed: membership.run.restart.is_some() && membership.run.config.drives(),
             journal_first: 0,
             is_on_board: true,
         })
@@ -255,17 +252,16 @@ impl TickPublisher {
     /// Keeps the tick in the journal. Returns false if it is not to be sent now.
     fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
         if header.tick < self.committed_ticks {
-            return Ok(self.shows_committed && header.tick + 1 == self.committed_ticks);
+            return Ok(false);
         }
         let Some(trainer) = &mut self.trainer else {
             return Ok(true);
         };
         let is_due = trainer.may_send();
-        let is_shown = is_due || trainer.shows_again(header.tick);
         trainer.keep(*header, payload)?;
         if is_due {
             trainer.count_live();
         }
-        Ok(is_shown)
+        Ok(is_due)
     }
 }

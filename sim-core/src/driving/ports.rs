@@ -1,4 +1,4 @@
-//! The driving task's ports: reads `prediction` and `observation` (which vehicle has which slot), publishes `ego-pose`.
+//! The driving task's ports: reads `prediction`, publishes `ego-pose`.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -9,9 +9,9 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     header::MessageHeader,
     membership::{RequiredConsumers, RunMembership, Wait},
-    observation::{EMPTY_SLOT, ObservationLayout},
+    observation::EMPTY_SLOT,
     ports::{Message, PortError, Publisher, Subscriber},
-    prediction::PredictionLayout,
+    prediction::{ACTION_COLUMNS, PredictionLayout},
     services::Channel,
     traffic::{Kind, RoutePoint, SignalMeta, VehicleMeta},
     world::{HeroView, VehicleState, WorldLayout},
@@ -22,8 +22,6 @@ use crate::{action_log::ActionLog, mirror::Mirror, scene::Scene};
 
 /// Ticks that sensors are ahead of the actions, in strict lock-step.
 const SENSED_AHEAD: u64 = 2;
-/// Values of an action: steering and acceleration.
-const ACTION_COLUMNS: u32 = 2;
 
 /// Heroes, and the ports that drive them.
 #[derive(Debug)]
@@ -34,7 +32,6 @@ pub struct HeroPorts {
     driver: HeroDriver,
     log: ActionLog<LoggedAction>,
     predictions: Subscriber,
-    observations: Subscriber,
     poses: Publisher,
     /// The required consumers of `ego-pose`.
     pose_consumers: RequiredConsumers,
@@ -55,7 +52,6 @@ impl HeroPorts {
             driver: membership.run.config.task.driver,
             log: ActionLog::new(&membership.run.run_dir, membership.run.env_index, SENSED_AHEAD),
             predictions: membership.subscriber(Channel::Prediction)?,
-            observations: membership.subscriber(Channel::Observation)?,
             poses: membership.publisher(Channel::EgoPose)?,
             pose_consumers: membership.required_consumers(Channel::EgoPose)?,
         })
@@ -101,7 +97,6 @@ impl HeroPorts {
         if let Some(actions) = self.log.actions_before(run, frame.episode, frame.tick)? {
             // The trainer may answer these ticks again: its answers must not fill the queue.
             while self.predictions.receive()?.is_some() {}
-            while self.observations.receive()?.is_some() {}
             self.apply(&actions, frame.tick, mirror);
             return Ok(Wait::Ready);
         }
@@ -113,17 +108,13 @@ impl HeroPorts {
         else {
             return Ok(Wait::Ready);
         };
-        let Some(answer) = next(membership, &self.predictions, Channel::Prediction, before)? else {
-            return Ok(Wait::Stopped);
-        };
-        let Some(question) = next(membership, &self.observations, Channel::Observation, before)? else {
+        let Some(answer) = next(membership, &self.predictions, before)? else {
             return Ok(Wait::Stopped);
         };
         // Actions of the episode before belong to heroes that ended with it.
         let mut of_heroes = Vec::new();
-        if question.header().episode == frame.episode {
-            let actions = actions(&answer, question.header().shape[0])?;
-            let vehicles = vehicles(&question).map_err(unreadable)?;
+        if answer.header().episode == frame.episode {
+            let (vehicles, actions) = actions(&answer)?;
             let pairs = vehicles.iter().zip(actions);
             of_heroes.extend(
                 pairs
@@ -198,21 +189,16 @@ impl HeroPorts {
     }
 }
 
-/// The message of `tick`; skips older ones. `None` once the process is asked to stop.
-fn next(
-    membership: &RunMembership,
-    port: &Subscriber,
-    channel: Channel,
-    tick: u64,
-) -> Result<Option<Message>, Failure> {
+/// The prediction for `tick`; skips older ones. `None` once the process is asked to stop.
+fn next(membership: &RunMembership, predictions: &Subscriber, tick: u64) -> Result<Option<Message>, Failure> {
     loop {
-        let Some(message) = membership.next(port)? else {
+        let Some(message) = membership.next(predictions)? else {
             return Ok(None);
         };
         let received = message.header().tick;
         if received > tick {
             return Err(PortError::Gap {
-                channel: channel.name(),
+                channel: Channel::Prediction.name(),
                 expected: tick,
                 received,
             }
@@ -224,27 +210,25 @@ fn next(
     }
 }
 
-/// The actions in a prediction, one for each slot.
-fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
+/// The vehicle of each slot, and its action.
+fn actions(answer: &Message) -> Result<(&[u32], &[[f32; 2]]), Failure> {
     let header = answer.header();
-    let [rows, columns, ..] = header.shape;
-    if columns != ACTION_COLUMNS || rows != slots {
+    let [rows, columns, _, answered] = header.shape;
+    if columns as usize != ACTION_COLUMNS || answered != rows {
         return Err(Failure::new(
             FailureKind::Run,
             format!(
-                "tick {}: the trainer sent actions of shape [{rows}, {columns}], the task needs [{slots}, {ACTION_COLUMNS}]",
+                "tick {}: the trainer sent actions of shape [{rows}, {columns}] for {answered} slots, the task needs [n, {ACTION_COLUMNS}] \
+                 for n slots",
                 header.tick
             ),
         )
         .with_help("send steering and acceleration for each slot of every observation"));
     }
-    block::view(answer.payload(), PredictionLayout::of(header).prediction).map_err(unreadable)
-}
-
-fn vehicles(question: &Message) -> Result<&[u32], BlockError> {
-    let header = question.header();
-    let layout = ObservationLayout::of(header);
-    block::view(question.payload(), layout.vehicle)
+    let layout = PredictionLayout::of(header);
+    let vehicles = block::view(answer.payload(), layout.vehicle).map_err(unreadable)?;
+    let actions = block::view(answer.payload(), layout.prediction).map_err(unreadable)?;
+    Ok((vehicles, actions))
 }
 
 fn unreadable(error: BlockError) -> Failure {
