@@ -287,7 +287,10 @@ def test_vehicles_of_each_environment_are_shown_and_steered(tmp_path: Path) -> N
         page.wait_for_run("two", "alive")
         choices = "[...document.querySelector('#environment').options].map((one) => one.value).join()"
         page.wait(f"{choices} === '0,1' && !document.querySelector('#environment-label').hidden")
-        page.wait("window.panelMap.users().length > 0")
+        for environment in ("1", "0"):
+            # Environments do not begin at the same moment.
+            vehicles_of(page, environment)
+            page.wait("window.panelMap.users().length > 0")
         page.click("#pause")
         page.wait_for_command("caraware control --run two pause")
         places = {environment: vehicles_of(page, environment) for environment in ("0", "1")}
@@ -307,7 +310,7 @@ def test_vehicles_of_each_environment_are_shown_and_steered(tmp_path: Path) -> N
 
 
 def vehicles_of(page: PanelPage, environment: str) -> list[list[float]]:
-    """Chooses an environment of a paused run; returns the places of its vehicles, m."""
+    """Chooses an environment; returns the places of its vehicles, m."""
     page.choose("#environment", environment)
     page.wait(f"document.querySelector('#map').dataset.environment === '{environment}'")
     places: list[list[float]] = page.browser.evaluate("window.panelMap.users().map((user) => [user.x_m, user.y_m])")
