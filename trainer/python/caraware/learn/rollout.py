@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from caraware.ipc.arrays import Scalar
 from caraware.ipc.image import ImageShape
 from caraware.ipc.stream import EMPTY_SLOT, LearningTick, SeeingTick
 
@@ -112,15 +111,18 @@ class Rollout:
         self._last_tick = -1
         self._taken = 0
         self._cut = np.zeros(0, bool)
+        self._newest_slots = b"", b""
+        """`vehicle` and `valid` of the newest row, as bytes, which compare faster than arrays."""
         self._allocate(ticks=16, slots=1)
 
     def add(self, obs: LearningTick, drawn: DrawnTick | None = None) -> None:
         """Copy one training tick, and what was drawn for it. Ticks without a valid row are skipped."""
         self.ended(obs)
-        rows = len(obs.vehicle)
+        vehicle, valid = obs.vehicle, obs.valid
+        rows = len(vehicle)
         if rows > self._slots:
             self._grow(self._capacity, rows)
-        samples = int(np.count_nonzero(obs.valid))
+        samples = int(np.count_nonzero(valid))
         if samples == 0:
             return
         if self._ticks == self._capacity:
@@ -128,23 +130,24 @@ class Rollout:
         t = self._ticks
         if t == 0:
             self._cut = obs.terminated | obs.truncated
-        self._observation[t, :rows] = obs.observation
+        self._observation[t, :rows] = obs.observation.numpy()
         if self._dark_is_nan:
-            self._observation[t, :rows].nan_to_num_()
-        self._truth[t, :rows] = obs.truth
+            torch.from_numpy(self._observation[t, :rows]).nan_to_num_()
+        self._truth[t, :rows] = obs.truth.numpy()
         if self._image_shape is not None:
             assert isinstance(obs, SeeingTick)
             frames = self._images[self._leading + t]
-            frames[: len(obs.images)] = obs.images
+            frames[: len(obs.images)] = obs.images.numpy()
             frames[len(obs.images) :] = 0
-        self._set_row(self._vehicle[t], obs.vehicle, EMPTY_SLOT)
-        self._set_row(self._valid[t], obs.valid, False)
-        self._terminated[t] = self._truncated[t] = False
+        self._vehicle[t, :rows], self._valid[t, :rows] = vehicle, valid
         self._tick[t] = obs.tick
-        self._ended_by[t] = 0
         if drawn is not None:
-            self._action[t, :rows], self._log_probability[t, :rows] = drawn.action, drawn.log_probability
-        self._close_changed_slots(t)
+            self._action[t, :rows] = drawn.action.numpy()
+            self._log_probability[t, :rows] = drawn.log_probability.numpy()
+        slots = vehicle.tobytes(), valid.tobytes()
+        if t > 0 and slots != self._newest_slots:
+            self._close_changed_slots(t)
+        self._newest_slots = slots
         self._ticks, self._last_tick = t + 1, obs.tick
         self._samples, self._newest_samples = self._samples + samples, samples
 
@@ -156,8 +159,11 @@ class Rollout:
         t = self._ticks - 1
         if obs.tick == self._last_tick + 1:
             rows = min(len(obs.vehicle), self._slots)
-            self._terminated[t, :rows] |= obs.terminated[:rows]
-            self._truncated[t, :rows] |= obs.truncated[:rows] & ~obs.terminated[:rows]
+            terminated, truncated = obs.terminated[:rows], obs.truncated[:rows]
+            # Most ticks end no trajectory.
+            if np.count_nonzero(terminated) or np.count_nonzero(truncated):
+                self._terminated[t, :rows] |= terminated
+                self._truncated[t, :rows] |= truncated & ~terminated
             if self._actions:
                 self._ended_by[t, :rows] = obs.ended_by[:rows]
         elif obs.tick != self._last_tick:
@@ -176,29 +182,29 @@ class Rollout:
         """The collected horizon, to be learned from before the next `add`, which starts again."""
         end = self._ticks - 1 if self._bootstrap else self._ticks
         horizon = Horizon(
-            observation=self._observation[:end],
-            truth=self._truth[:end],
+            observation=torch.from_numpy(self._observation[:end]),
+            truth=torch.from_numpy(self._truth[:end]),
             vehicle=torch.from_numpy(self._vehicle[:end].astype(np.int64)),
             tick=torch.from_numpy(self._tick[:end].copy()),
             valid=torch.from_numpy(self._valid[:end].copy()),
             terminated=torch.from_numpy(self._terminated[:end].copy()),
             truncated=torch.from_numpy(self._truncated[:end].copy()),
             cut=torch.from_numpy(np.pad(self._cut, (0, self._slots - len(self._cut)))),
-            bootstrap=self._observation[end].clone() if self._bootstrap else None,
+            bootstrap=_clone(self._observation[end]) if self._bootstrap else None,
             drawn=self._drawn(end) if self._actions else None,
-            images=self._images[: self._leading + end] if self._image_shape else None,
+            images=torch.from_numpy(self._images[: self._leading + end]) if self._image_shape else None,
         )
         self._taken, self._samples = end, self._newest_samples if self._bootstrap else 0
         return horizon
 
     def _drawn(self, end: int) -> DrawnHorizon:
         """What was drawn in the `end` first ticks."""
-        held = DrawnTick(int(self._tick[end]), self._action[end].clone(), self._log_probability[end].clone())
+        held = DrawnTick(int(self._tick[end]), _clone(self._action[end]), _clone(self._log_probability[end]))
         return DrawnHorizon(
-            action=self._action[:end],
-            log_probability=self._log_probability[:end],
+            action=torch.from_numpy(self._action[:end]),
+            log_probability=torch.from_numpy(self._log_probability[:end]),
             ended_by=torch.from_numpy(self._ended_by[:end].astype(np.int64)),
-            truth_after=self._truth[end].clone(),
+            truth_after=_clone(self._truth[end]),
             held=held,
         )
 
@@ -206,27 +212,27 @@ class Rollout:
         """Move the tick that only served as a bootstrap, if any, to the front."""
         if self._taken == 0:
             return
+        left = self._ticks - self._taken
         for array in self._arrays():
-            array[: self._ticks - self._taken] = array[self._taken : self._ticks]
+            array[:left] = array[self._taken : self._ticks]
         if self._image_shape is not None:
-            left = self._images[self._leading + self._taken : self._leading + self._ticks]
-            self._images[self._leading : self._leading + len(left)] = left
-        self._ticks -= self._taken
-        self._taken = 0
+            images = self._images[self._leading + self._taken : self._leading + self._ticks]
+            self._images[self._leading : self._leading + left] = images
+        self._clear(left, self._ticks)
+        self._ticks, self._taken = left, 0
         # The horizon before has the ends of trajectories before a tick that only served as a bootstrap.
         self._cut = np.zeros(0, bool)
 
+    def _clear(self, begin: int, end: int) -> None:
+        """Empty the slots of some rows. `add` relies on it: it writes only the slots and flags that a tick has."""
+        self._vehicle[begin:end] = EMPTY_SLOT
+        for array in (self._valid, self._terminated, self._truncated, self._ended_by):
+            array[begin:end] = 0
+
     def _close_changed_slots(self, t: int) -> None:
         """A slot that changed hands, or has a gap, without a flag: its trajectory continued unseen."""
-        if t == 0:
-            return
         went_on = (self._vehicle[t] == self._vehicle[t - 1]) & self._valid[t]
         self._truncated[t - 1] |= self._valid[t - 1] & ~went_on & ~self._terminated[t - 1]
-
-    @staticmethod
-    def _set_row(row: NDArray[Scalar], values: NDArray[Scalar], empty: int) -> None:
-        row[: len(values)] = values
-        row[len(values) :] = empty
 
     def _arrays(self) -> tuple[Any, ...]:
         return (
@@ -244,19 +250,19 @@ class Rollout:
 
     def _allocate(self, ticks: int, slots: int) -> None:
         self._capacity, self._slots = ticks, slots
-        self._observation = torch.zeros(ticks, slots, self._size)
-        self._truth = torch.zeros(ticks, slots, 4)
+        self._observation = _zeros(ticks, slots, self._size)
+        self._truth = _zeros(ticks, slots, 4)
         self._vehicle = np.full((ticks, slots), EMPTY_SLOT, np.uint32)
         self._valid = np.zeros((ticks, slots), bool)
         self._terminated = np.zeros((ticks, slots), bool)
         self._truncated = np.zeros((ticks, slots), bool)
         self._tick = np.zeros(ticks, np.int64)
         drawn_slots = slots if self._actions else 0
-        self._action = torch.zeros(ticks, drawn_slots, self._actions)
-        self._log_probability = torch.zeros(ticks, drawn_slots)
+        self._action = _zeros(ticks, drawn_slots, self._actions)
+        self._log_probability = _zeros(ticks, drawn_slots)
         self._ended_by = np.zeros((ticks, drawn_slots), np.uint32)
         if self._image_shape is not None:
-            self._images = torch.zeros(self._leading + ticks, slots, *self._image_shape.size, dtype=torch.uint8)
+            self._images = _zeros(self._leading + ticks, slots, *self._image_shape.size, dtype=torch.uint8)
 
     def _grow(self, ticks: int, slots: int) -> None:
         """More ticks or slots. Rare: the slots in use settle early, the ticks double up to one horizon."""
@@ -271,3 +277,14 @@ class Rollout:
                 new[:t] = array[:t]
             else:
                 new[:t, : min(wide, array.shape[1])] = array[:t]
+
+
+def _zeros(*shape: int, dtype: torch.dtype = torch.float32) -> NDArray[Any]:
+    """Zeros in memory that torch has aligned for its kernels, as an array: numpy assigns a small row much faster."""
+    array: NDArray[Any] = torch.zeros(shape, dtype=dtype).numpy()
+    return array
+
+
+def _clone(array: NDArray[Any]) -> Tensor:
+    """A copy in torch's memory."""
+    return torch.from_numpy(array).clone()

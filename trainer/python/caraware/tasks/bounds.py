@@ -1,7 +1,9 @@
 """The box of the map, which the positions of the localisation task span."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import torch
 from torch import Tensor
 
 from caraware.ipc.run_file import ConfigError, RunFile
@@ -29,6 +31,15 @@ class MapBounds:
 
     def to_world_m(self, action: Tensor) -> Tensor:
         """Map actions `[..., 2]` to world metres. Affine and unclipped: ±1 is the edge, beyond it lies outside."""
-        half = action.new_tensor([self.x_max_m - self.x_min_m, self.y_max_m - self.y_min_m]) / 2
-        centre = action.new_tensor([self.x_max_m + self.x_min_m, self.y_max_m + self.y_min_m]) / 2
+        half, centre = _half_and_centre_m(self, action.dtype, action.device)
         return action * half + centre
+
+
+@lru_cache(maxsize=16)
+def _half_and_centre_m(box: MapBounds, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Half the extent of a box and its centre, `[2]` each (m): kept, because they take longer than their use."""
+    # A tensor made in inference mode could not be used in training later.
+    with torch.inference_mode(False):
+        half = torch.tensor([box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m], dtype=dtype, device=device) / 2
+        centre = torch.tensor([box.x_max_m + box.x_min_m, box.y_max_m + box.y_min_m], dtype=dtype, device=device) / 2
+    return half, centre

@@ -6,6 +6,7 @@ It names a place in the map, as in the paper, or corrects the newest fix (`task.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -128,10 +129,10 @@ def raw_errors_m(ticks: Sequence[MeasuredTick]) -> list[FloatArray]:
 
     The same numbers, bit for bit, whichever ticks come together.
     """
-    truth = torch.cat([obs.truth for obs in ticks]).numpy()
-    errors = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
-    ends = np.cumsum([len(obs.valid) for obs in ticks])[:-1]
-    return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
+    truth = np.concatenate([obs.truth.numpy() for obs in ticks])
+    errors = _distance_m(np.concatenate([obs.gnss_m.numpy() for obs in ticks]), truth)
+    ends = list(accumulate((len(obs.valid) for obs in ticks), initial=0))
+    return [errors[begin:end][obs.valid] for obs, (begin, end) in zip(ticks, pairwise(ends), strict=True)]
 
 
 def _distance_m(position: FloatArray, truth: FloatArray) -> FloatArray:
