@@ -1,4 +1,4 @@
-//! The runs that are disturbed: small ones of three kinds, so that many disturbances meet a start, an update, a commit or an evaluation.
+//! The runs that are disturbed: small ones of four kinds, so that many disturbances meet a start, an update, a commit or an evaluation.
 
 use std::{
     path::{Path, PathBuf},
@@ -29,6 +29,17 @@ static TOWN: [&str; 6] = [
     "traffic.pedestrians=3",
     "episode.ticks=300",
     "episode.evaluation_ticks=50",
+];
+/// The world waits for the policy's actions at every tick.
+const HEROES: [&str; 8] = [
+    "traffic.heroes=4",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "task.time_limit_s=10",
+    "episode.ticks=300",
+    "episode.evaluation_ticks=50",
+    "trainer.network=mlp",
+    "trainer.hidden=[16]",
 ];
 const GRID: [&str; 6] = [
     "run.envs=2",
@@ -61,15 +72,17 @@ pub struct EnduranceCase {
     own: Option<Target>,
     /// A handover goes to a learner of another kind and back, instead of to the same.
     pub learners_take_turns: bool,
+    /// False in the driving task: a simulator that dies is made again with logged actions, and a full disk leaves gaps in their log.
+    pub survives_a_full_disk: bool,
 }
 
 impl EnduranceCase {
-    /// The town with a step of 0.1 s, with one learner and with two in turn, and in `directory` a generated `.sumocfg` with a step of 1 s and
-    /// two environments.
+    /// The town with a step of 0.1 s, with one learner, with two in turn and with heroes, and in `directory` a generated `.sumocfg` with a
+    /// step of 1 s and two environments.
     ///
     /// # Errors
     /// SUMO's programs are missing, or the directory is not writable.
-    pub fn all(directory: &Path) -> Result<[Self; 3], Exit> {
+    pub fn all(directory: &Path) -> Result<[Self; 4], Exit> {
         let sumocfg = generate(directory)?;
         Ok([
             Self {
@@ -79,6 +92,7 @@ impl EnduranceCase {
                 envs: 1,
                 own: Some(Target::V2x),
                 learners_take_turns: false,
+                survives_a_full_disk: true,
             },
             Self {
                 name: "grid",
@@ -87,6 +101,7 @@ impl EnduranceCase {
                 envs: 2,
                 own: Some(Target::Recorder),
                 learners_take_turns: false,
+                survives_a_full_disk: true,
             },
             Self {
                 name: "learners",
@@ -95,6 +110,16 @@ impl EnduranceCase {
                 envs: 1,
                 own: None,
                 learners_take_turns: true,
+                survives_a_full_disk: true,
+            },
+            Self {
+                name: "heroes",
+                input: "driving".into(),
+                settings: &HEROES,
+                envs: 1,
+                own: None,
+                learners_take_turns: false,
+                survives_a_full_disk: false,
             },
         ])
     }

@@ -44,7 +44,7 @@ const VIEWERS: usize = 3;
 /// The learners that take turns: ours, and the one of docs/learners.md.
 const LEARNERS: [&str; 2] = ["caraware.train", "caraware.examples.minimal_learner"];
 /// What is done, and how many cards of the deck each has: a run draws them all.
-const DECK: [(Disturbance, usize); 13] = [
+const DECK: [(Disturbance, usize); 14] = [
     (Disturbance::Kill(Target::Trainer), 10),
     (Disturbance::Kill(Target::TrafficBridge), 3),
     (Disturbance::Kill(Target::SimCore), 3),
@@ -56,6 +56,7 @@ const DECK: [(Disturbance, usize); 13] = [
     (Disturbance::Pause, 2),
     (Disturbance::Hang, 1),
     (Disturbance::Handover, 2),
+    (Disturbance::HeldHandover, 2),
     (Disturbance::Viewer, 4),
     (Disturbance::FullDisk, 1),
 ];
@@ -71,6 +72,8 @@ enum Disturbance {
     Hang,
     /// The trainer is replaced by its successor, or by a learner of another kind.
     Handover,
+    /// The simulation is paused by a command, its trainer is replaced, and it is resumed at once, while the successor still catches up.
+    HeldHandover,
     /// A viewer is killed or stopped, and others are started.
     Viewer,
     /// The disk of the runs is full for a while.
@@ -348,6 +351,7 @@ impl<'a> DisturbedRun<'a> {
             Disturbance::Pause => self.pause_process(),
             Disturbance::Hang => self.hang_process(),
             Disturbance::Handover => self.hand_over(),
+            Disturbance::HeldHandover => self.hand_over_while_paused(),
             Disturbance::Viewer => self.disturb_viewers(),
             Disturbance::FullDisk => self.fill_disk(),
         }
@@ -470,6 +474,53 @@ impl<'a> DisturbedRun<'a> {
         if self.watched.is_none() {
             return Ok(false);
         }
+        let client = self.ask_for_handover()?;
+        // Every second time the next disturbance may come amid the handover.
+        if self.random.bool() {
+            self.handovers.push(client);
+            return Ok(true);
+        }
+        if !self.count_handover(client)? {
+            // It is asked for again after all other disturbances.
+            self.cards.insert(0, Disturbance::Handover);
+        }
+        Ok(true)
+    }
+
+    /// Pauses the simulation, replaces the trainer and resumes. The pause is refused while an environment is being made again.
+    fn hand_over_while_paused(&mut self) -> Result<bool, Exit> {
+        if self.watched.is_none() || !self.control("pause")? {
+            return Ok(false);
+        }
+        self.counts.count("paused");
+        let client = self.ask_for_handover()?;
+        let is_made = self.count_handover(client)?;
+        let begun = Instant::now();
+        while !self.control("resume")? && self.ended()?.is_none() {
+            if begun.elapsed() > DEADLINE {
+                self.fault("a paused run was not resumed");
+                break;
+            }
+            pause();
+        }
+        if !is_made {
+            self.cards.insert(0, Disturbance::HeldHandover);
+        }
+        Ok(true)
+    }
+
+    /// Sends a command to all environments; true if it was carried out.
+    fn control(&self, action: &str) -> Result<bool, Exit> {
+        let mut command = self
+            .place
+            .command(&["control", action, "--run", &self.name].map(str::to_owned));
+        let status = command.stderr(Stdio::null()).status();
+        let status = status.map_err(|error| Exit::io("start", &self.place.caraware, &error))?;
+        Ok(status.success())
+    }
+
+    /// Starts a client that asks for a handover.
+    fn ask_for_handover(&mut self) -> Result<Child, Exit> {
         let mut arguments = vec!["handover".to_owned(), self.name.clone()];
         if self.random.bool() {
             arguments.push("--now".into());
@@ -481,16 +532,7 @@ impl<'a> DisturbedRun<'a> {
         let client = self.place.command(&arguments).stderr(Stdio::piped()).spawn();
         let client = client.map_err(|error| Exit::io("start", &self.place.caraware, &error))?;
         self.counts.count("handover asked for");
-        // Every second time the next disturbance may come amid the handover.
-        if self.random.bool() {
-            self.handovers.push(client);
-            return Ok(true);
-        }
-        if !self.count_handover(client)? {
-            // It is asked for again after all other disturbances.
-            self.cards.insert(0, Disturbance::Handover);
-        }
-        Ok(true)
+        Ok(client)
     }
 
     /// The learner's module that the run does not have now.
@@ -653,8 +695,12 @@ impl<'a> DisturbedRun<'a> {
 fn draw_cards(place: &EndurancePlace, case: &EnduranceCase, random: &mut fastrand::Rng) -> Vec<Disturbance> {
     let is_possible = |(disturbance, _): &(Disturbance, usize)| match disturbance {
         Disturbance::Kill(target) => case.has(*target),
-        Disturbance::FullDisk => place.has_small_disk,
-        Disturbance::Pause | Disturbance::Hang | Disturbance::Handover | Disturbance::Viewer => true,
+        Disturbance::FullDisk => place.has_small_disk && case.survives_a_full_disk,
+        Disturbance::Pause
+        | Disturbance::Hang
+        | Disturbance::Handover
+        | Disturbance::HeldHandover
+        | Disturbance::Viewer => true,
     };
     let of_kind = |(disturbance, count): (Disturbance, usize)| {
         std::iter::repeat_n(disturbance, if place.is_quick { 1 } else { count })
