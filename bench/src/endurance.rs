@@ -42,12 +42,10 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "endurance",
         "Endurance",
         "Small runs are disturbed at random moments until each has completed: processes are killed (the supervisor too: then the run is \
-         resumed), stopped for up to 1.5 s, or stopped until they are killed as hanging, trainers are replaced, also while the run is paused, viewers \
-         come, stop and die, \
-         the disk is full for up to 1.5 s. Each \
-         is compared with the undisturbed run of the same seed. `town` has one environment, a step of 0.1 s and messages between \
-         vehicles; `grid` is a generated `.sumocfg` with a step of 1 s, two environments and a lossless recording. In `learners` the \
-         town's trainer is replaced by another learner and back. What was learnt is not compared there, and lost ticks count where the last \
+         resumed), stopped for up to 1.5 s, or stopped until they are killed as hanging. Trainers are replaced, in paused runs too. Viewers \
+         come, stop and die, and the disk is full for up to 1.5 s. Each run is compared with the undisturbed run of the same seed. \
+         `town` has one environment, a step of 0.1 s and messages between vehicles; `grid` is a generated `.sumocfg` with a step of \
+         1 s, two environments and a lossless recording. In `learners` the town's trainer is replaced by another learner and back. What was learnt is not compared there, and lost ticks count where the last \
          learner counts them. In `heroes` a policy drives four vehicles of the town, and the disk is never full. Not disturbed: the \
          memory.",
     );

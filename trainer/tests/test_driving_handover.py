@@ -164,7 +164,7 @@ def test_a_driving_run_goes_to_a_script_to_another_learner_and_back() -> None:
     assert report["dynamics"]["heroes"]["episodes"] >= 8
 
 
-def test_a_successor_that_is_slow_to_answer_again_gets_all_ticks() -> None:
+def test_a_run_that_is_resumed_before_its_slow_successor_has_caught_up_continues() -> None:
     """The run is resumed while the successor still answers ticks that the world has gone on from."""
     with tempfile.TemporaryDirectory(prefix="cw-") as short:
         Path(short, "slow_driver.py").write_text(SLOW_DRIVER)

@@ -10,26 +10,24 @@ from caraware.ipc.channel import read_only_tensor
 from caraware.ipc.image import ImageShape
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.rollout import DrawnHorizon, DrawnTick, Horizon, Rollout
+from synthetic import SyntheticObservation
 from torch import Tensor
 
 FIELDS, ACTIONS, LEADING = 5, 2, 2
 SHAPE = ImageShape("binary", channels=1, height=2, width=3)
 
 
-@dataclass
-class Tick:
-    """What a rollout takes of a tick of `n` slots."""
+@dataclass(kw_only=True)
+class Tick(SyntheticObservation):
+    """A tick of heroes with cameras, `n` slots."""
 
-    tick: int
-    observation: Tensor
-    truth: Tensor
-    gnss_m: Tensor
-    vehicle: np.ndarray
-    valid: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    ended_by: np.ndarray
+    ends: np.ndarray
     images: Tensor
+
+    @property
+    def ended_by(self) -> np.ndarray:
+        """u32 `[n]`."""
+        return self.ends
 
 
 class PlainRollout:
@@ -188,7 +186,7 @@ class Street:
             valid=valid,
             terminated=flagged[0],
             truncated=flagged[1],
-            ended_by=np.where(flagged.any(0), rng.integers(0, 2**32, n), 0).astype(np.uint32),
+            ends=np.where(flagged.any(0), rng.integers(0, 2**32, n), 0).astype(np.uint32),
             images=self.lent(rng.integers(0, 256, (seen, *SHAPE.size), np.uint8)),
         )
 
