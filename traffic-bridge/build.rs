@@ -22,6 +22,7 @@ fn main() {
         "lanes.h",
         "error_tee.h",
         "text.h",
+        "vehicle_object.h",
     ] {
         println!("cargo:rerun-if-changed=src/sumo/{file}");
     }

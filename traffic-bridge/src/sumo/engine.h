@@ -28,6 +28,10 @@ namespace engine = ::libsumo;
 
 #include "traffic-bridge/src/sumo/shim.h"
 
+// SUMO's own (vehicle_object.h).
+class MSLane;
+class MSVehicle;
+
 namespace caraware {
 
 class ErrorTee;
@@ -90,6 +94,8 @@ private:
         std::string id;
         bool is_person;
         bool gone;
+        // Null for persons and for vehicles of another process or of `mesosim`.
+        const MSVehicle* object;
     };
 
     // The traffic light of a link, by its place in `lights_`, and the number of the link there.
@@ -109,7 +115,10 @@ private:
     void note_loads();
     void depart(const std::string& id, bool is_person);
     void arrive(std::size_t place);
-    void read_vehicle(const std::string& id, RawState& state) const;
+    void read_vehicle(const Live& vehicle, RawState& state);
+    void read_on_road(const Live& vehicle, RawState& state);
+    void read_by_id(const std::string& id, RawState& state) const;
+    std::int32_t lane_place(const std::string& id) const;
     void read_person(const std::string& id, RawState& state);
     void read_all();
     void put_in_order();
@@ -143,6 +152,8 @@ private:
     std::unordered_map<std::string, std::size_t> person_places_;
     // Place among the net's lanes of an id; empty if lanes are not read. Never iterated.
     std::unordered_map<std::string, std::int32_t> lane_places_;
+    // The same by SUMO's own lanes, of those on which a vehicle has been. Never iterated.
+    std::unordered_map<const MSLane*, std::int32_t> lane_object_places_;
     // The same for edges.
     std::unordered_map<std::string, std::int32_t> edge_places_;
     // Of each lane of the net, by its place, that of its edge.

@@ -13,6 +13,9 @@
 #include "traffic-bridge/src/sumo/error_tee.h"
 #include "traffic-bridge/src/sumo/libsumo.rs.h"
 #include "traffic-bridge/src/sumo/text.h"
+#ifndef CARAWARE_OVER_TRACI
+#include "traffic-bridge/src/sumo/vehicle_object.h"
+#endif
 
 namespace caraware::CARAWARE_ENGINE {
 
@@ -107,6 +110,7 @@ void EngineSimulation::start(rust::Slice<const rust::String> arguments, rust::St
     reading_order_.clear();
     late_ = 0;
     lane_places_.clear();
+    lane_object_places_.clear();
     edge_places_.clear();
     lane_edges_.clear();
     reads_positions_ = false;
@@ -274,7 +278,12 @@ void EngineSimulation::depart(const std::string& id, bool is_person) {
     places.emplace(id, live_.size());
     reading_order_.push_back(live_.size());
     ++late_;
-    live_.push_back(Live{id, is_person, false});
+#ifdef CARAWARE_OVER_TRACI
+    const MSVehicle* const object = nullptr;
+#else
+    const MSVehicle* const object = is_person ? nullptr : vehicle_object(id);
+#endif
+    live_.push_back(Live{id, is_person, false, object});
     states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_, NO_LANE, 0.0, NO_LANE, NO_LANE, invalid, AFOOT});
     events_.push_back(std::move(departure));
     ++next_index_;
@@ -292,15 +301,66 @@ void EngineSimulation::arrive(std::size_t place) {
     }
 }
 
-void EngineSimulation::read_vehicle(const std::string& id, RawState& state) const {
-    const libsumo::TraCIPosition position = engine::Vehicle::getPosition3D(id);
+void EngineSimulation::read_vehicle(const Live& vehicle, RawState& state) {
     state.previous_speed = state.speed;
+    state.lane = NO_LANE;
+#ifdef CARAWARE_OVER_TRACI
+    const bool is_on_road = false;
+#else
+    const bool is_on_road = vehicle.object != nullptr && vehicle.object->isOnRoad();
+    if (is_on_road) {
+        read_on_road(vehicle, state);
+    }
+#endif
+    if (!is_on_road) {
+        read_by_id(vehicle.id, state);
+    }
+    if (state.x == libsumo::INVALID_DOUBLE_VALUE) {
+        return;
+    }
+    if (reads_positions_) {
+        state.edge = state.lane == NO_LANE ? NO_LANE : lane_edges_[static_cast<std::size_t>(state.lane)];
+    }
+    if ((steps_ + state.index) % signal_period_steps_ == 0) {
+        state.signals = engine::Vehicle::getSignals(vehicle.id);
+    }
+}
+
+#ifndef CARAWARE_OVER_TRACI
+// As `read_by_id`, without a search by id for each value.
+void EngineSimulation::read_on_road(const Live& vehicle, RawState& state) {
+    const MSVehicle& object = *vehicle.object;
+    const MSVehiclePosition position = object.getPosition(0.0);
+    state.x = position.x;
+    state.y = position.y;
+    state.z = position.z;
+    state.angle = GeomHelper::naviDegree(object.getAngle());
+    state.speed = object.getSpeed();
+    if (has_elevation_) {
+        state.slope = object.getSlope();
+    }
+    if (!lane_places_.empty()) {
+        const auto [place, is_new] = lane_object_places_.try_emplace(object.getLane(), NO_LANE);
+        if (is_new) {
+            place->second = lane_place(engine::Vehicle::getLaneID(vehicle.id));
+        }
+        state.lane = place->second;
+        state.lane_position = object.getPositionOnLane();
+    }
+    if (reads_positions_) {
+        state.route_index = object.getRoutePosition();
+        state.odometer = object.getOdometer();
+    }
+}
+#endif
+
+void EngineSimulation::read_by_id(const std::string& id, RawState& state) const {
+    const libsumo::TraCIPosition position = engine::Vehicle::getPosition3D(id);
     state.x = position.x;
     state.y = position.y;
     state.z = position.z;
     state.angle = engine::Vehicle::getAngle(id);
     state.speed = engine::Vehicle::getSpeed(id);
-    state.lane = NO_LANE;
     if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
         return;
     }
@@ -312,18 +372,18 @@ void EngineSimulation::read_vehicle(const std::string& id, RawState& state) cons
         }
     }
     if (!lane_places_.empty()) {
-        const auto lane = lane_places_.find(engine::Vehicle::getLaneID(id));
-        state.lane = lane == lane_places_.end() ? NO_LANE : lane->second;
+        state.lane = lane_place(engine::Vehicle::getLaneID(id));
         state.lane_position = engine::Vehicle::getLanePosition(id);
     }
     if (reads_positions_) {
-        state.edge = state.lane == NO_LANE ? NO_LANE : lane_edges_[static_cast<std::size_t>(state.lane)];
         state.route_index = engine::Vehicle::getRouteIndex(id);
         state.odometer = engine::Vehicle::getDistance(id);
     }
-    if ((steps_ + state.index) % signal_period_steps_ == 0) {
-        state.signals = engine::Vehicle::getSignals(id);
-    }
+}
+
+std::int32_t EngineSimulation::lane_place(const std::string& id) const {
+    const auto place = lane_places_.find(id);
+    return place == lane_places_.end() ? NO_LANE : place->second;
 }
 
 void EngineSimulation::read_person(const std::string& id, RawState& state) {
@@ -377,7 +437,7 @@ void EngineSimulation::read_all() {
             if (road_user.is_person) {
                 read_person(road_user.id, states_[place]);
             } else {
-                read_vehicle(road_user.id, states_[place]);
+                read_vehicle(road_user, states_[place]);
             }
         } catch (const libsumo::TraCIException&) {
             arrive(place);  // SUMO removed it without listing it among the arrivals.

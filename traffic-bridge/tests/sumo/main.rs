@@ -3,6 +3,7 @@
 
 mod interpolation;
 mod lifecycle;
+mod objects;
 mod population;
 mod process;
 mod right_of_way;
