@@ -3,15 +3,15 @@
 use std::{
     collections::BTreeMap,
     fs::{File, OpenOptions},
-    io::{Seek as _, SeekFrom, Write},
+    io::{Cursor, Seek, SeekFrom, Write},
     num::NonZero,
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
 use ipc_schema::{channel::Channel, config::RecordConfig, digest::ObservationDigest, header::MessageHeader, layout};
-use mcap::{Attachment, WriteOptions, Writer, records::MessageHeader as McapMessageHeader, write::NoSeek};
+use mcap::{Attachment, WriteOptions, Writer, records::MessageHeader as McapMessageHeader};
 
 use super::{
     CHUNK_TOPIC, END, MESSAGE_ENCODING, PROFILE, RecordingEnd, RecordingError, RecordingStart, SCHEMA_ENCODING, START,
@@ -22,39 +22,73 @@ const CHUNK_WITHIN: Duration = Duration::from_secs(2);
 /// Bytes of a message header.
 const HEADER_BYTES: usize = size_of::<MessageHeader>();
 
-/// Threads that compress while the next messages are taken in: one, and two where enough cores are there for a run beside them.
-fn compression_threads() -> u32 {
+/// Bytes before the newest part of the file whose pages the system is asked for once more: those that were not on the disk yet.
+const LATE_PAGES: u64 = 64 << 20;
+
+/// Threads that compress while the next messages are taken in. A recorder that no process waits for compresses by itself, which takes
+/// the least processor time; with producers that wait it has one, and two where enough cores are there for a run beside them.
+fn compression_threads(is_lossless: bool) -> u32 {
     match std::thread::available_parallelism().map_or(1, NonZero::get) {
+        _ if !is_lossless => 0,
         0..6 => 1,
         _ => 2,
     }
 }
 
-/// What the MCAP writer has written and the file does not have yet.
+/// What the MCAP writer has written and the file does not have yet. A chunk is compressed into it, and then gets its header at its beginning.
 #[derive(Debug, Clone, Default)]
-struct PendingBytes(Arc<Mutex<Vec<u8>>>);
+struct PendingBytes(Arc<Mutex<Pending>>);
+
+#[derive(Debug, Default)]
+struct Pending {
+    /// Bytes before these.
+    before: u64,
+    bytes: Cursor<Vec<u8>>,
+}
 
 impl PendingBytes {
+    fn lock(&self) -> MutexGuard<'_, Pending> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Moves the bytes behind those of `unwritten`. Both keep their memory: without it each chunk would ask the system for new pages.
     fn move_to(&self, unwritten: &mut Vec<u8>) {
-        let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pending = self.lock();
+        let bytes = pending.bytes.get_mut();
+        let moved = bytes.len() as u64;
         match unwritten.is_empty() {
-            true => std::mem::swap(unwritten, &mut pending),
-            false => unwritten.append(&mut pending),
+            true => std::mem::swap(unwritten, bytes),
+            false => unwritten.append(bytes),
         }
+        pending.before += moved;
+        pending.bytes.set_position(0);
     }
 }
 
 impl Write for PendingBytes {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        pending.extend_from_slice(bytes);
-        Ok(bytes.len())
+        self.lock().bytes.write(bytes)
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
     }
+}
+
+impl Seek for PendingBytes {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        let mut pending = self.lock();
+        let before = pending.before;
+        let to = match to {
+            SeekFrom::Start(position) => SeekFrom::Start(position.checked_sub(before).ok_or_else(is_written)?),
+            to => to,
+        };
+        Ok(before + pending.bytes.seek(to)?)
+    }
+}
+
+fn is_written() -> std::io::Error {
+    std::io::Error::new(std::io::ErrorKind::InvalidInput, "these bytes are in the file already")
 }
 
 /// A topic whose messages are lines of JSON.
@@ -109,7 +143,7 @@ pub struct RecordingWriter {
     /// Complete bytes that are not in the file yet.
     unwritten: Vec<u8>,
     pending: PendingBytes,
-    mcap: Writer<NoSeek<PendingBytes>>,
+    mcap: Writer<PendingBytes>,
     start: RecordingStart,
     /// Numbers of the recorded channels in the file, by [`Channel`].
     channels: [Option<u16>; Channel::COUNT],
@@ -165,11 +199,10 @@ impl RecordingWriter {
             .library(concat!("caraware ", env!("CARGO_PKG_VERSION")))
             // The library passes the level on as a signed number.
             .compression_level(chunks.compression_level.cast_unsigned())
-            .compression_threads(compression_threads())
-            .chunk_size(None)
-            .disable_seeking(true);
+            .compression_threads(compression_threads(start.is_lossless))
+            .chunk_size(None);
         let format = |error: mcap::McapError| format_error(path, &error);
-        let mut mcap = options.create(NoSeek::new(pending.clone())).map_err(format)?;
+        let mut mcap = options.create(pending.clone()).map_err(format)?;
         let json = |value: serde_json::Result<Vec<u8>>| value.map_err(|error| format_error(path, &error));
         let mut attach = |name: &str, data: &[u8]| {
             mcap.attach(&Attachment {
@@ -359,7 +392,18 @@ impl RecordingWriter {
         }
         self.len += self.unwritten.len() as u64;
         self.unwritten.clear();
+        self.drop_pages();
         Ok(())
+    }
+
+    /// Asks the system to begin to write what is new to the disk, and to drop what is there. Its memory is used again then: new pages
+    /// take longer, and a file that fills the memory pushes that of other programs out of the caches.
+    fn drop_pages(&self) {
+        let from = self.len_before.saturating_sub(LATE_PAGES);
+        let len = NonZero::new(self.len - from);
+        if let Err(error) = rustix::fs::fadvise(&self.file, from, len, rustix::fs::Advice::DontNeed) {
+            tracing::debug!(%error, "the system keeps the recording in memory");
+        }
     }
 
     /// Gives the space of the newest chunk back to a run that continues on a full disk without its recording.
