@@ -5,6 +5,7 @@ use std::{io, path::PathBuf};
 use ipc_schema::{SCHEMA_VERSION, run::RunFile};
 use serde::{Deserialize, Serialize};
 
+mod pages;
 mod place;
 pub mod reader;
 pub mod writer;

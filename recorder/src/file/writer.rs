@@ -15,6 +15,7 @@ use mcap::{Attachment, WriteOptions, Writer, records::MessageHeader as McapMessa
 
 use super::{
     CHUNK_TOPIC, END, MESSAGE_ENCODING, PROFILE, RecordingEnd, RecordingError, RecordingStart, SCHEMA_ENCODING, START,
+    pages::WrittenPages,
 };
 
 /// Longest time that a message waits for its chunk to be full.
@@ -22,15 +23,11 @@ const CHUNK_WITHIN: Duration = Duration::from_secs(2);
 /// Bytes of a message header.
 const HEADER_BYTES: usize = size_of::<MessageHeader>();
 
-/// Bytes before the newest part of the file whose pages the system is asked for once more: those that were not on the disk yet.
-const LATE_PAGES: u64 = 64 << 20;
-
-/// Threads that compress while the next messages are taken in. A recorder that no process waits for compresses by itself, which takes
-/// the least processor time; with producers that wait it has one, and two where enough cores are there for a run beside them.
+/// Threads that compress while the next messages are taken in: two where enough cores are there for a run beside them. On fewer cores
+/// producers that wait for the recorder get one. A recorder that no process waits for compresses by itself, which costs least.
 fn compression_threads(is_lossless: bool) -> u32 {
     match std::thread::available_parallelism().map_or(1, NonZero::get) {
-        _ if !is_lossless => 0,
-        0..6 => 1,
+        0..6 => u32::from(is_lossless),
         _ => 2,
     }
 }
@@ -136,6 +133,7 @@ impl From<&RecordConfig> for ChunkOptions {
 pub struct RecordingWriter {
     path: PathBuf,
     file: File,
+    pages: WrittenPages,
     /// Bytes of the file that are complete.
     len: u64,
     /// Bytes of the file without what was written last.
@@ -237,9 +235,14 @@ impl RecordingWriter {
             plain(commands.name(), "json").map_err(format)?,
             plain(curriculum.name(), "json").map_err(format)?,
         ];
+        let pages = WrittenPages::of(&file).map_err(|source| RecordingError::Io {
+            path: path.into(),
+            source,
+        })?;
         let mut writer = Self {
             path: path.into(),
             file,
+            pages,
             len: 0,
             len_before: 0,
             unwritten: Vec::new(),
@@ -392,18 +395,8 @@ impl RecordingWriter {
         }
         self.len += self.unwritten.len() as u64;
         self.unwritten.clear();
-        self.drop_pages();
+        self.pages.drop_until(self.len);
         Ok(())
-    }
-
-    /// Asks the system to begin to write what is new to the disk, and to drop what is there. Its memory is used again then: new pages
-    /// take longer, and a file that fills the memory pushes that of other programs out of the caches.
-    fn drop_pages(&self) {
-        let from = self.len_before.saturating_sub(LATE_PAGES);
-        let len = NonZero::new(self.len - from);
-        if let Err(error) = rustix::fs::fadvise(&self.file, from, len, rustix::fs::Advice::DontNeed) {
-            tracing::debug!(%error, "the system keeps the recording in memory");
-        }
     }
 
     /// Gives the space of the newest chunk back to a run that continues on a full disk without its recording.
