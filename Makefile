@@ -77,6 +77,7 @@ $(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/requirements-devkits
 	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
 		> $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
+	$(call COMPILE,$(VENV)) 'import torch._dynamo, matplotlib.pyplot'
 	touch $@
 
 # The environment $(1) gets the pins of requirements.lock, or of those that the packages $(2) ask for. Python compiles a module when it
@@ -104,9 +105,12 @@ install: wheels ## an environment of its own in PREFIX, from the wheels: PREFIX/
 	$(PREFIX)/bin/pip install --disable-pip-version-check --quiet --no-deps --force-reinstall target/wheels/*.whl
 	$(COMPILE_IMPORTED)
 
-# Compiles the modules of PREFIX that a run imports. Later users, and a container's, may not write beside them: each start of a trainer
-# would compile them again, which takes 3 s of processor time.
-COMPILE_IMPORTED = env -u PYTHONDONTWRITEBYTECODE -u PYTHONPYCACHEPREFIX $(PREFIX)/bin/python -c 'import torch._dynamo, \
+# Compiles what the environment $(1) imports. Later users, and a container's, may not write beside it, and PYTHONDONTWRITEBYTECODE forbids
+# it: each start of a trainer would compile the modules again, which takes half of the start.
+COMPILE = env -u PYTHONDONTWRITEBYTECODE -u PYTHONPYCACHEPREFIX $(1)/bin/python -c
+
+# All modules that a run imports.
+COMPILE_IMPORTED = $(call COMPILE,$(PREFIX)) 'import torch._dynamo, \
 	caraware.train, caraware.play, caraware.run.loop, caraware.ipc.channel, caraware.fusion.train, caraware.report.plots, caraware_viewer.__main__'
 
 image: ## a container image of Containerfile, by podman, buildah or docker
