@@ -92,6 +92,9 @@ pub struct BenchArgs {
     /// Checkpoint, or file of parameters, of the policy that `driving` compares
     #[arg(long, value_name = "PATH")]
     pub policy: Option<PathBuf>,
+    /// Map of `driving`: "avenue", a .net.xml, or a .sumocfg, of which the net is used [default: the town]
+    #[arg(long, value_name = "MAP")]
+    pub map: Option<String>,
     /// Trips of each driver in `driving`
     #[arg(long, value_name = "TRIPS", default_value_t = 480, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub trips: u32,

@@ -125,7 +125,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let episodes = trips.div_ceil(HEROES * densities.len() as u32).max(1);
     let mut report = BenchReport::new(
         "driving",
-        "Trips through the town",
+        format!("Trips through {}", options.map.as_deref().unwrap_or("the town")),
         format!(
             "Each driver drives the same {} trips: {HEROES} heroes that begin each of {episodes} evaluation episodes, at {} times the \
              traffic of the preset `driving`, at most {TIME_LIMIT_S} s. Their seeds are used by no training. A trip that does not end \
@@ -172,10 +172,16 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
 }
 
 fn drivers(options: &BenchOptions) -> Vec<TripDriver> {
+    let map = options.map.iter().flat_map(|map| map_settings(map));
+    let map: Vec<String> = map.collect();
     let driver = |name, key, settings: &[&str]| TripDriver {
         name,
         key,
-        settings: settings.iter().map(|&setting| setting.to_owned()).collect(),
+        settings: settings
+            .iter()
+            .map(|&setting| setting.to_owned())
+            .chain(map.clone())
+            .collect(),
     };
     let mut drivers = vec![
         driver("random actions", "random", &[]),
@@ -187,6 +193,15 @@ fn drivers(options: &BenchOptions) -> Vec<TripDriver> {
         drivers.push(driver("learnt policy", "policy", &[&place]));
     }
     drivers
+}
+
+/// A run's settings for this map. A file's net may have no projection, and where on Earth it is does not matter to a driver.
+fn map_settings(map: &str) -> Vec<String> {
+    let mut settings = vec![format!("curriculum.maps=[{map:?}]")];
+    if Path::new(map).extension().is_some() {
+        settings.extend(["map.origin_latitude_deg=52.0", "map.origin_longitude_deg=10.0"].map(str::to_owned));
+    }
+    settings
 }
 
 /// The trips of one driver at one density.
@@ -317,6 +332,14 @@ fn wilson(successes: f64, trials: f64) -> [f64; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_net_of_ones_own_needs_no_place_on_earth() {
+        assert_eq!(map_settings("avenue"), ["curriculum.maps=[\"avenue\"]"]);
+        let own = map_settings("nets/a.net.xml");
+        assert_eq!(own[0], "curriculum.maps=[\"nets/a.net.xml\"]");
+        assert_eq!(own.len(), 3);
+    }
 
     #[test]
     fn wilsons_interval_has_its_known_values_and_stays_within_a_share() {

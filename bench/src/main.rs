@@ -51,6 +51,8 @@ pub struct BenchOptions {
     pub minutes: u32,
     /// Seed of the disturbances.
     pub seed: u64,
+    /// The map that is driven through; the town without one.
+    pub map: Option<String>,
     /// The policy whose driving is measured.
     pub policy: Option<PathBuf>,
     /// Trips of each driver.
@@ -92,6 +94,7 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
             .as_ref()
             .map(|path| std::path::absolute(path).unwrap_or_else(|_| path.clone())),
         trips: args.trips,
+        map: args.map.clone(),
     };
     let parts = match args.part {
         BenchPart::All => BenchPart::speeds().collect(),

@@ -475,12 +475,14 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
         "{message} {help}"
     );
 
-    let (message, help) = error_of("[curriculum]\nmaps = [\"town\"]\n");
+    let (message, help) = error_of("[curriculum]\nmaps = [\"town\", \"avenue\"]\n");
     assert!(
-        message.contains("my.toml:2: `curriculum.maps` are for the stages of a curriculum"),
+        message.contains("my.toml:2: `curriculum.maps` has several maps, but there are no stages"),
         "{message}"
     );
     assert!(help.contains("[[curriculum.stages]]"), "{help}");
+    let alone = config_of("[curriculum]\nmaps = [\"nets/b.net.xml\"]\n").unwrap();
+    assert_eq!(alone.curriculum.map_names(), ["b"]);
     let one = "[[curriculum.stages]]\ncavs = 1\n";
     let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"Town02\"]\n{one}"));
     assert!(

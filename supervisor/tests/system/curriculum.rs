@@ -189,6 +189,25 @@ fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2
 }
 
 #[test]
+fn one_map_alone_is_that_of_the_whole_run() {
+    let workplace = with_city();
+    let alone = [
+        "curriculum.maps=[\"city/city.sumocfg\"]",
+        "episode.ticks=40",
+        "episode.training_episodes=1",
+        "traffic.pedestrians=0",
+    ];
+    workplace.succeed(&arguments("simulate", "alone", &alone));
+    let run = RunFile::read(&workplace.path().join("runs/alone/run.json")).unwrap();
+    assert!(
+        run.scene_files.net_file.ends_with("city/city.net.xml"),
+        "{:?}",
+        run.scene_files
+    );
+    assert!(workplace.report("alone")["vehicle_steps"].as_u64() > Some(100));
+}
+
+#[test]
 fn lessons_are_on_the_maps_of_their_stages_and_the_same_seed_gives_the_same_bytes() {
     let workplace = with_city();
     workplace.succeed(&arguments("train", "maps", &MAPS));

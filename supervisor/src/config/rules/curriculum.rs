@@ -123,12 +123,11 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
         let message = format!("`curriculum.maps` has {} maps", maps.len());
         return refuse(message, &format!("give at most {MOST_MAPS}"));
     }
-    // The avenue alone is the map of the whole run; the town is so without being named.
-    let is_own_alone = matches!(maps.as_slice(), [CurriculumMap::Avenue]);
-    if !maps.is_empty() && !is_own_alone && config.curriculum.stages.is_empty() {
+    // One map alone is that of the whole run.
+    if maps.len() > 1 && config.curriculum.stages.is_empty() {
         return refuse(
-            "`curriculum.maps` are for the stages of a curriculum, and the configuration has no stages".into(),
-            "add a [[curriculum.stages]], or set curriculum.maps = []; to run a scenario unchanged, name its .sumocfg in place of the preset",
+            "`curriculum.maps` has several maps, but there are no stages to choose from them".into(),
+            "add a [[curriculum.stages]], or name one map; to run a scenario unchanged, name its .sumocfg in place of the preset",
         );
     }
     let mut names = BTreeSet::new();
