@@ -94,8 +94,6 @@ private:
         std::string id;
         bool is_person;
         bool gone;
-        // Null for persons and for vehicles of another process or of `mesosim`.
-        const MSVehicle* object;
     };
 
     // The traffic light of a link, by its place in `lights_`, and the number of the link there.
@@ -115,8 +113,8 @@ private:
     void note_loads();
     void depart(const std::string& id, bool is_person);
     void arrive(std::size_t place);
-    void read_vehicle(const Live& vehicle, RawState& state);
-    void read_on_road(const Live& vehicle, RawState& state);
+    void read_vehicle(const std::string& id, RawState& state);
+    void read_on_road(const std::string& id, const MSVehicle& vehicle, RawState& state);
     void read_by_id(const std::string& id, RawState& state) const;
     std::int32_t lane_place(const std::string& id) const;
     void read_person(const std::string& id, RawState& state);

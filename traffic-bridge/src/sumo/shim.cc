@@ -278,12 +278,7 @@ void EngineSimulation::depart(const std::string& id, bool is_person) {
     places.emplace(id, live_.size());
     reading_order_.push_back(live_.size());
     ++late_;
-#ifdef CARAWARE_OVER_TRACI
-    const MSVehicle* const object = nullptr;
-#else
-    const MSVehicle* const object = is_person ? nullptr : vehicle_object(id);
-#endif
-    live_.push_back(Live{id, is_person, false, object});
+    live_.push_back(Live{id, is_person, false});
     states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_, NO_LANE, 0.0, NO_LANE, NO_LANE, invalid, AFOOT});
     events_.push_back(std::move(departure));
     ++next_index_;
@@ -301,19 +296,21 @@ void EngineSimulation::arrive(std::size_t place) {
     }
 }
 
-void EngineSimulation::read_vehicle(const Live& vehicle, RawState& state) {
+void EngineSimulation::read_vehicle(const std::string& id, RawState& state) {
     state.previous_speed = state.speed;
     state.lane = NO_LANE;
 #ifdef CARAWARE_OVER_TRACI
     const bool is_on_road = false;
 #else
-    const bool is_on_road = vehicle.object != nullptr && vehicle.object->isOnRoad();
+    // In every step: SUMO may have deleted the vehicle without listing it as arrived, and then this throws.
+    const MSVehicle* const vehicle = vehicle_object(id);
+    const bool is_on_road = vehicle != nullptr && vehicle->isOnRoad();
     if (is_on_road) {
-        read_on_road(vehicle, state);
+        read_on_road(id, *vehicle, state);
     }
 #endif
     if (!is_on_road) {
-        read_by_id(vehicle.id, state);
+        read_by_id(id, state);
     }
     if (state.x == libsumo::INVALID_DOUBLE_VALUE) {
         return;
@@ -322,34 +319,33 @@ void EngineSimulation::read_vehicle(const Live& vehicle, RawState& state) {
         state.edge = state.lane == NO_LANE ? NO_LANE : lane_edges_[static_cast<std::size_t>(state.lane)];
     }
     if ((steps_ + state.index) % signal_period_steps_ == 0) {
-        state.signals = engine::Vehicle::getSignals(vehicle.id);
+        state.signals = engine::Vehicle::getSignals(id);
     }
 }
 
 #ifndef CARAWARE_OVER_TRACI
 // As `read_by_id`, without a search by id for each value.
-void EngineSimulation::read_on_road(const Live& vehicle, RawState& state) {
-    const MSVehicle& object = *vehicle.object;
-    const MSVehiclePosition position = object.getPosition(0.0);
+void EngineSimulation::read_on_road(const std::string& id, const MSVehicle& vehicle, RawState& state) {
+    const MSVehiclePosition position = vehicle.getPosition(0.0);
     state.x = position.x;
     state.y = position.y;
     state.z = position.z;
-    state.angle = GeomHelper::naviDegree(object.getAngle());
-    state.speed = object.getSpeed();
+    state.angle = GeomHelper::naviDegree(vehicle.getAngle());
+    state.speed = vehicle.getSpeed();
     if (has_elevation_) {
-        state.slope = object.getSlope();
+        state.slope = vehicle.getSlope();
     }
     if (!lane_places_.empty()) {
-        const auto [place, is_new] = lane_object_places_.try_emplace(object.getLane(), NO_LANE);
+        const auto [place, is_new] = lane_object_places_.try_emplace(vehicle.getLane(), NO_LANE);
         if (is_new) {
-            place->second = lane_place(engine::Vehicle::getLaneID(vehicle.id));
+            place->second = lane_place(engine::Vehicle::getLaneID(id));
         }
         state.lane = place->second;
-        state.lane_position = object.getPositionOnLane();
+        state.lane_position = vehicle.getPositionOnLane();
     }
     if (reads_positions_) {
-        state.route_index = object.getRoutePosition();
-        state.odometer = object.getOdometer();
+        state.route_index = vehicle.getRoutePosition();
+        state.odometer = vehicle.getOdometer();
     }
 }
 #endif
@@ -437,7 +433,7 @@ void EngineSimulation::read_all() {
             if (road_user.is_person) {
                 read_person(road_user.id, states_[place]);
             } else {
-                read_vehicle(road_user, states_[place]);
+                read_vehicle(road_user.id, states_[place]);
             }
         } catch (const libsumo::TraCIException&) {
             arrive(place);  // SUMO removed it without listing it among the arrivals.

@@ -1,5 +1,5 @@
 // SUMO's own vehicle objects. `libsumo::Vehicle` searches a tree of all vehicles by id for each value that it returns, which takes
-// longer than to read the value. So the objects are found once, when a vehicle departs.
+// longer than to read the value. So an object is found once in each step.
 //
 // The functions are those that `libsumo::Vehicle` calls, exported by the same library but declared in none of its headers. If a version
 // of SUMO lacks one, the linker says so. `traffic-bridge/tests/sumo/objects.rs` compares what they return with libsumo's getters.
@@ -53,8 +53,8 @@ extern "C" const void* const _ZTV9MSVehicle[];
 
 namespace caraware {
 
-// The object of a vehicle that has departed; null with `mesosim`, whose vehicles are of another class. It is valid until SUMO lists the
-// vehicle as arrived: SUMO announces each departed vehicle as arrived before it deletes it (`MSVehicleControl::removePending`).
+// The object of a vehicle; null with `mesosim`, whose vehicles are of another class. It is valid until the next step or command. Throws
+// if SUMO has no such vehicle.
 inline const MSVehicle* vehicle_object(const std::string& id) {
     constexpr int FIRST_FUNCTION = 2;
     const MSBaseVehicle* const vehicle = libsumo::Helper::getVehicle(id);
