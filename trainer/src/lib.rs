@@ -525,9 +525,10 @@ impl Attached {
     /// A `sensor-daemon` that was started again sends what it cannot know to have arrived: what has been received before is skipped.
     fn next_message(&mut self) -> PyResult<Option<TickMessages>> {
         loop {
-            let observation = match self.unpaired.take() {
-                Some(waiting) => Some(waiting),
-                None => self.observations.receive().map_err(|error| failed(&error))?,
+            // Polls call this, and nearly always nothing waits: a look is cheaper than moving a message that is not there.
+            let observation = match self.unpaired.is_some() {
+                true => self.unpaired.take(),
+                false => self.observations.receive().map_err(|error| failed(&error))?,
             };
             let Some(observation) = observation else {
                 return Ok(None);

@@ -22,6 +22,7 @@ from caraware.trials.study import (
     SEEN,
     SILENT_S,
     Goal,
+    Interrupts,
     Search,
     StudyPlace,
     began,
@@ -177,6 +178,24 @@ def test_two_searches_share_a_study_and_make_its_trials_once(tmp_path: Path) -> 
         report = json.loads((tmp_path / row["run"] / "report.json").read_text())
         assert row["error_m"] == report["ppo_mean_error_m"]
     assert {"history.png", "slices.png", "live.png"} <= {file.name for file in (tmp_path / "s").iterdir()}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_until_the_storage_is_not_in_use_and_a_second_does_not(number: signal.Signals) -> None:
+    before = {known: signal.getsignal(known) for known in (signal.SIGINT, signal.SIGTERM)}
+    interrupts = Interrupts()
+    try:
+        interrupts.catch()
+        interrupts.raise_if_any()
+        # As in the middle of a transaction.
+        os.kill(os.getpid(), number)
+        with pytest.raises(KeyboardInterrupt):
+            interrupts.raise_if_any()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+    finally:
+        for known, handler in before.items():
+            signal.signal(known, handler)
 
 
 def test_an_interrupted_or_killed_search_goes_on_and_leaves_no_run_behind(tmp_path: Path) -> None:

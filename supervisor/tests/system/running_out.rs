@@ -1,7 +1,8 @@
 //! Whole runs that run out of shared memory, of disk space or of file handles: a clear error or a wait, never a signal or a hang.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
+    ffi::OsString,
     fs::{DirBuilder, File},
     io::Write as _,
     net::TcpStream,
@@ -54,14 +55,14 @@ fn pid_of(words: [&str; 2]) -> Option<Pid> {
     })
 }
 
-/// Processor time of the processes with `word` in their command lines, in the kernel's ticks of 10 ms, and whether one runs or could.
-fn processor_time(word: &str) -> (u64, bool) {
+/// Processor time of the processes with `word` in their command lines, in the kernel's ticks of 10 ms, and those that run or could.
+fn processor_time(word: &str) -> (u64, BTreeSet<OsString>) {
     let processes = std::fs::read_dir("/proc").unwrap().flatten();
     let ours = processes.filter(|entry| {
         let line = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
         String::from_utf8_lossy(&line).contains(word)
     });
-    let (mut ticks, mut is_busy) = (0, false);
+    let (mut ticks, mut busy) = (0, BTreeSet::new());
     for entry in ours {
         let stat = std::fs::read_to_string(entry.path().join("stat")).unwrap_or_default();
         // The name in parentheses may have spaces; see proc_pid_stat(5).
@@ -72,10 +73,12 @@ fn processor_time(word: &str) -> (u64, bool) {
                 .and_then(|field| field.parse::<u64>().ok())
                 .unwrap_or(0)
         };
-        is_busy |= fields.first() == Some(&"R");
+        if fields.first() == Some(&"R") {
+            busy.insert(entry.file_name());
+        }
         ticks += number(11) + number(12);
     }
-    (ticks, is_busy)
+    (ticks, busy)
 }
 
 /// Another program's file, which takes all space of a file system until it is dropped, also what is freed later: a process whose
@@ -271,12 +274,21 @@ impl RunOnFullDisk {
 
     /// Waits until the run stands still: for two seconds none of its processes has computed or wanted to. Their logs do not say that
     /// they wait, because there is no space for that either.
+    ///
+    /// A process that only looks whether there is space again gets its core late where others use the machine. So only one that is seen
+    /// without a pause wants to compute.
     fn wait_until_it_stands_still(&mut self) {
+        const LOOKS: u32 = 8;
         let workplace = self.said.0.parent().unwrap().to_string_lossy().into_owned();
         let mut since = (Instant::now(), u64::MAX);
+        let mut looks = BTreeMap::new();
         until(&mut self.run, "a run that stands still", || {
-            let (ticks, is_busy) = processor_time(&workplace);
-            if is_busy || ticks.abs_diff(since.1) > 10 {
+            let (ticks, busy) = processor_time(&workplace);
+            looks.retain(|process, _| busy.contains(process));
+            for process in busy {
+                *looks.entry(process).or_insert(0) += 1;
+            }
+            if looks.values().any(|&looks| looks >= LOOKS) || ticks.abs_diff(since.1) > 10 {
                 since = (Instant::now(), ticks);
             }
             std::thread::park_timeout(Duration::from_millis(20));

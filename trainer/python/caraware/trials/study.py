@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import optuna
@@ -100,12 +101,46 @@ class StudyPlace:
         return JournalStorage(JournalFileBackend(str(file)))
 
 
+class Interrupts:
+    """Ctrl-C and SIGTERM, which wait until the storage is not in use: half of a transaction locks a data base.
+
+    A second one does not wait.
+    """
+
+    def __init__(self) -> None:
+        self._has_come = False
+
+    def catch(self) -> None:
+        """Catch them from now on. Clusters end jobs by SIGTERM, which a container's first process would ignore."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self._has_come:
+            raise KeyboardInterrupt
+        self._has_come = True
+
+    def raise_if_any(self) -> None:
+        """Raises `KeyboardInterrupt` once one has come."""
+        if self._has_come:
+            raise KeyboardInterrupt
+
+
 class Search:
     """A study that runs its trials one after the other."""
 
-    def __init__(self, place: StudyPlace, space: Space, goal: Goal, command: list[str], seed: int) -> None:
+    def __init__(
+        self,
+        place: StudyPlace,
+        space: Space,
+        goal: Goal,
+        command: list[str],
+        seed: int,
+        interrupts: Interrupts | None = None,
+    ) -> None:
         """`command` is that of a run, without its name and the varied keys."""
         self._place, self._space, self._goal, self._command, self._seed = place, space, goal, command, seed
+        self._interrupts = interrupts or Interrupts()
         self._study = optuna.create_study(
             study_name=place.name,
             storage=place.open_storage(),
@@ -125,9 +160,13 @@ class Search:
         return self._study.get_trials(deepcopy=False)
 
     def search(self, most: int) -> None:
-        """Run trials until there are `most` that have not failed, on all machines. Raises `TrialFailed`."""
+        """Run trials until there are `most` that have not failed, on all machines.
+
+        Raises `TrialFailed`, and `KeyboardInterrupt` once one has come and the trial's run has ended.
+        """
         failures = 0
         while self._made() < most:
+            self._interrupts.raise_if_any()
             try:
                 self._try()
                 failures = 0
@@ -175,6 +214,7 @@ class Search:
 
         def beat() -> None:
             nonlocal beaten
+            self._interrupts.raise_if_any()
             if time.monotonic() - beaten > BEAT_S:
                 trial.set_user_attr(SEEN, time.time())
                 beaten = time.monotonic()
@@ -185,6 +225,8 @@ class Search:
                 if trial.should_prune():
                     print(f"trial {trial.number}: stopped at {self._goal.live} {value:.4g}", flush=True)
                     return None
+            # Ctrl-C in a terminal has ended the run, too.
+            self._interrupts.raise_if_any()
             return run.final(self._goal.of_report)
 
     def _refuse_another_study(self, what: str) -> None:
@@ -317,13 +359,13 @@ def main(arguments: Sequence[str]) -> int:
         command = [str(program), "train", options.config, "--quiet"]
         for setting in options.set:
             command += ["--set", setting]
-        search = Search(place, space, goal, command, options.seed)
+        interrupts = Interrupts()
+        search = Search(place, space, goal, command, options.seed, interrupts)
     except (SpaceError, ProgramError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     status = 0
-    # Clusters end jobs by SIGTERM, which a container's first process ignores without a handler.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    interrupts.catch()
     try:
         search.search(options.trials)
     except TrialFailed:
