@@ -275,10 +275,11 @@ impl RunOnFullDisk {
     /// Waits until the run stands still: for two seconds none of its processes has computed or wanted to. Their logs do not say that
     /// they wait, because there is no space for that either.
     ///
-    /// A process that only looks whether there is space again gets its core late where others use the machine. So only one that is seen
-    /// without a pause wants to compute.
+    /// A process that only looks whether there is space again gets its core late where others use the machine, and takes longer then:
+    /// the supervisor alone takes 3 % of a core. So only a process that is seen without a pause wants to compute.
     fn wait_until_it_stands_still(&mut self) {
         const LOOKS: u32 = 8;
+        const MOST_TICKS: u64 = 30;
         let workplace = self.said.0.parent().unwrap().to_string_lossy().into_owned();
         let mut since = (Instant::now(), u64::MAX);
         let mut looks = BTreeMap::new();
@@ -288,7 +289,7 @@ impl RunOnFullDisk {
             for process in busy {
                 *looks.entry(process).or_insert(0) += 1;
             }
-            if looks.values().any(|&looks| looks >= LOOKS) || ticks.abs_diff(since.1) > 10 {
+            if looks.values().any(|&looks| looks >= LOOKS) || ticks.abs_diff(since.1) > MOST_TICKS {
                 since = (Instant::now(), ticks);
             }
             std::thread::park_timeout(Duration::from_millis(20));
