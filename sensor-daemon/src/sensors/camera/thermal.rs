@@ -4,6 +4,8 @@
 //! Planck's law integrated from 8 to 14 µm. On the way the air takes a share of that and adds its own. A pixel is the temperature of the
 //! black body that would radiate as much, as radiometric cameras report it. Temperatures are plausible, not measured.
 
+use std::sync::LazyLock;
+
 use ipc_schema::config::WeatherConfig;
 
 use super::{labels::SemanticLabel, light::rain_extinction_per_m};
@@ -21,27 +23,31 @@ const RANGE_K: [f64; 2] = [150.0, 450.0];
 /// Steps of the table of temperatures.
 const STEPS: usize = 4096;
 
+/// Wavelengths at which Planck's law is taken, and their fifth powers in µm⁵: thousands of temperatures use them again.
+static WAVELENGTHS: LazyLock<[(f64, f64); 33]> = LazyLock::new(|| {
+    std::array::from_fn(|i| {
+        let wavelength_m = BAND_M[0] + (BAND_M[1] - BAND_M[0]) / 32.0 * i as f64;
+        (wavelength_m, libm::pow(wavelength_m * 1e6, 5.0))
+    })
+});
+
+/// Planck's law over the band, by Simpson's rule over 32 steps; without its constant factors.
+fn planck(temperature_k: f64) -> f64 {
+    let weighted = WAVELENGTHS.iter().enumerate().map(|(i, (wavelength_m, power))| {
+        let weight = match i {
+            0 | 32 => 1.0,
+            _ if i % 2 == 1 => 4.0,
+            _ => 2.0,
+        };
+        weight * (1.0 / (power * libm::expm1(SECOND_RADIATION_M_K / (wavelength_m * temperature_k))))
+    });
+    weighted.sum()
+}
+
 /// Radiance of a black body in the band, in units of that at 300 K.
 fn black_body(temperature_k: f64) -> f64 {
-    // Simpson's rule over 32 steps.
-    let integral = |t: f64| {
-        let step = (BAND_M[1] - BAND_M[0]) / 32.0;
-        let planck = |wavelength_m: f64| {
-            let micrometres = wavelength_m * 1e6;
-            1.0 / (libm::pow(micrometres, 5.0) * libm::expm1(SECOND_RADIATION_M_K / (wavelength_m * t)))
-        };
-        (0..=32_u32)
-            .map(|i| {
-                let weight = match i {
-                    0 | 32 => 1.0,
-                    _ if i % 2 == 1 => 4.0,
-                    _ => 2.0,
-                };
-                weight * planck(BAND_M[0] + step * f64::from(i))
-            })
-            .sum::<f64>()
-    };
-    integral(temperature_k) / integral(300.0)
+    static AT_300_K: LazyLock<f64> = LazyLock::new(|| planck(300.0));
+    planck(temperature_k) / *AT_300_K
 }
 
 /// Radiances of all that a thermal camera sees.
