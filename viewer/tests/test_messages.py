@@ -29,7 +29,8 @@ SETTINGS = (
     "episode.evaluation_interval=0",
     "episode.evaluation_ticks=40",
     "episode.final_evaluations=1",
-    "run.real_time_factor=4.0",
+    # A viewer draws the newest state: on a busy machine only one or two in a second.
+    "run.real_time_factor=1.0",
 )
 
 
@@ -49,8 +50,7 @@ def test_the_map_and_the_links_of_a_vehicle_in_a_real_run(tmp_path: Path) -> Non
     found = recordings.read(recorded)
     assert "known by CPM" in found[legend.SIGNS].newest("Points2D:labels")
     shown = [row for at, row in found[messages.KNOWN].rows if at > 0 and row.get("LineStrips2D:strips")]
-    # A viewer draws the newest state, and on a busy machine it draws few.
-    assert len(shown) > 4
+    assert len(shown) > 20
     colors = {color for row in shown for color in row["LineStrips2D:colors"]}
     assert colors >= {int(messages.SOURCE_COLORS[1]), int(messages.SOURCE_COLORS[2])}, "CAMs and CPMs"
     # What is known is near road users, up to the errors of receivers; mirrored it would not be.

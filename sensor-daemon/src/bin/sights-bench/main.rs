@@ -38,7 +38,7 @@ struct BenchSize {
 
 impl BenchSize {
     const FULL: Self = Self { rounds: 7, ticks: 20 };
-    const QUICK: Self = Self { rounds: 1, ticks: 1 };
+    const QUICK: Self = Self { rounds: 1, ticks: 2 };
 
     /// True if only the fastest instructions are measured, and too little of them.
     fn is_quick(&self) -> bool {
