@@ -172,8 +172,9 @@ def drive_trips(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     task = task_of_run(run)
     if not isinstance(task, Driving):
         raise ConfigError(f"`task.kind` is {task.name!r}", 'set task.kind = "driving"')
-    torch.set_num_threads(1)
     driver, trips, ended = DRIVERS[name](run), TripLog(run, task), False
+    # After the policy, which sets a thread for each core: for a few rows they only spin.
+    torch.set_num_threads(1)
     if role.gets_ready and not role.wait_for_turn(SuccessorClaims(task=task.name, environments=1)):
         return
     channel, steps, answered = Channel(str(run_file)), 0, -1
