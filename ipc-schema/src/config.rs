@@ -119,7 +119,14 @@ impl Config {
     pub fn heroes(&self) -> usize {
         match self.task.kind {
             TaskKind::Localisation | TaskKind::Lane | TaskKind::Messages => 0,
-            TaskKind::Driving => self.traffic.heroes as usize + self.traffic.hero_ids.len(),
+            TaskKind::Driving => {
+                let most = self
+                    .traffic_of_stages()
+                    .map(|traffic| traffic.heroes)
+                    .max()
+                    .unwrap_or(0);
+                most as usize + self.traffic.hero_ids.len()
+            }
         }
     }
 
@@ -241,6 +248,15 @@ pub struct TrafficConfig {
     pub heroes: u32,
     /// Edges of every hero's route; empty = at random.
     pub hero_route: Vec<String>,
+    /// Which routes heroes are given at random.
+    #[serde(default)]
+    pub hero_turns: HeroTurns,
+    /// Traffic lights are on; off, vehicles give way by the junctions' rules (population control).
+    #[serde(default = "on")]
+    pub traffic_lights: bool,
+    /// Factor on all speed limits (population control).
+    #[serde(default = "unchanged")]
+    pub speed_limit_factor: f64,
     /// SUMO ids of the heroes of a scenario (`.sumocfg`).
     pub hero_ids: Vec<String>,
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
@@ -278,6 +294,25 @@ pub struct TrafficConfig {
     pub trust_scenario: bool,
     /// Most road users alive at once; shared memory is laid out for them.
     pub max_road_users: u32,
+}
+
+/// Routes of heroes that are drawn at random.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HeroTurns {
+    /// Any.
+    #[default]
+    Any,
+    /// With at least one left turn at a junction that has other ways, too.
+    Left,
+}
+
+fn on() -> bool {
+    true
+}
+
+fn unchanged() -> f64 {
+    1.0
 }
 
 /// Where SUMO runs.

@@ -448,8 +448,8 @@ impl RunFile {
         let traffic = &self.config.traffic;
         let limit = match &self.source {
             Source::Population { .. } => {
-                let of_stages = self.config.curriculum.stages.iter().map(|stage| stage.cavs);
-                of_stages.fold(traffic.cavs, u32::max)
+                let of_stages = self.config.traffic_of_stages().map(|traffic| traffic.cavs);
+                of_stages.max().unwrap_or(traffic.cavs)
             }
             Source::Scenario { .. } if traffic.max_cavs > 0 => traffic.max_cavs,
             Source::Scenario { .. } => traffic.max_road_users,
@@ -589,7 +589,7 @@ impl RunFile {
         } = &self.config;
         match (&self.source, curriculum.stages.is_empty()) {
             (Source::Population { .. }, false) if self.mode != Mode::Play => {
-                Some(schedule::CurriculumPlan::new(episode, curriculum, self.config.run.seed))
+                Some(schedule::CurriculumPlan::new(episode, curriculum, self.seed()))
             }
             _ => None,
         }

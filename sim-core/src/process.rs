@@ -125,7 +125,7 @@ impl CoreProcess {
         let events = |name, state| ResynchronisationReporter::open(&membership, name, state);
         let resynchronisations = events("resynchronisations.jsonl", state.resynchronised)?;
         let guidances = events("guidances.jsonl", state.guided)?;
-        // Viewers see the run's own map, and heroes have no other.
+        // Viewers see the run's own map. Heroes begin on it, and change to that of each episode.
         let scene = Arc::clone(&scenes[0]);
         draw_chart(&membership, &scene)?;
         let actions = match membership.run.config.drives() {
@@ -171,6 +171,9 @@ impl CoreProcess {
         }
         if header.has(FIRST_OF_EPISODE) {
             self.store_state()?;
+            if let (Some(actions), Some(scene)) = (&mut self.actions, self.scenes.get(usize::from(header.map))) {
+                actions.enter_map(Arc::clone(scene));
+            }
         }
         self.apply_metas(header.meta_messages)?;
         let states: &[TrafficState] =

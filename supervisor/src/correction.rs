@@ -1,9 +1,10 @@
 //! What the default learner does where the user says no more: on a scenario it corrects fixes instead of naming places in a map that may
 //! be any size (decision 33), and where the world takes its actions it tries one.
 
+use ipc_schema::config::OWN_TRAINER;
 use serde_json::Value;
 
-use crate::config::{LayeredSettings, rules::OWN_TRAINER};
+use crate::config::LayeredSettings;
 
 /// What the policy sees of a scenario's vehicles at each of [`CORRECTING_HISTORY`] ticks: the paper's fields and the wheel speed.
 const CORRECTING_FIELDS: [&str; 10] = [

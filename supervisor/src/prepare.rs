@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use ipc_schema::{
     SCHEMA_VERSION,
-    config::{Config, LocalisationAction},
+    config::{Config, HeroTurns, LocalisationAction},
     control,
     process::Process,
     reserve,
@@ -333,6 +333,14 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
         return Err(Exit::config(
             "the stages of a curriculum set the number of vehicles, but a .sumocfg has its own vehicles",
             "name the .sumocfg in curriculum.maps and give a preset or .toml as CONFIG: its net then runs with population control",
+        ));
+    }
+    let changes_map =
+        !traffic.traffic_lights || traffic.speed_limit_factor != 1.0 || traffic.hero_turns != HeroTurns::Any;
+    if named.is_scenario() && changes_map {
+        return Err(Exit::config(
+            "`traffic.traffic_lights`, `traffic.speed_limit_factor` and `traffic.hero_turns` are for maps with population control, and a .sumocfg has its own traffic",
+            "leave them out, and change the scenario's own files",
         ));
     }
     if config.actor() == Some(Process::V2x) && mode == Mode::Simulate {

@@ -233,7 +233,7 @@ pub fn carry_over_logs(old: &RunFile, run_dir: &Path, mut beginning: Beginning) 
             "resume the run with the version that wrote it, or start another run",
         ));
     }
-    // The curriculum is decided once for all environments.
+    // A trainer decides the curriculum of one environment. Several count their lessons, and need no log.
     let stages = old.run_dir.join(CURRICULUM_LOG);
     if stages.exists() && old.run_dir != run_dir {
         std::fs::read(&stages)

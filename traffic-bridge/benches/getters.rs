@@ -6,7 +6,7 @@ use std::{
 };
 
 use traffic_bridge::{
-    population::{Population, PopulationSize},
+    population::{HeroRoutes, Population, PopulationSize},
     sumo::{Sumo, error::SumoError, frame::TrafficFrame, options::SumoOptions, processor_time_s},
 };
 
@@ -43,7 +43,7 @@ fn grid(sumo_home: &Path, folder: &Path, junctions: &str) -> std::io::Result<Pat
 
 fn measure(net: &Path, sumo_home: &Path) -> Result<(), SumoError> {
     let mut sumo = Sumo::start(SumoOptions::population(sumo_home, net, &[], 0.1, 1)?)?;
-    let mut population = Population::start(&mut sumo, SIZE, &[], 1)?;
+    let mut population = Population::start(&mut sumo, SIZE, HeroRoutes::default(), 1)?;
     let (mut frame, mut control_s, mut step_s, mut rows) = (TrafficFrame::default(), 0.0, 0.0, 0);
     let mut before = sumo.cost();
     for step in 0..WARM_UP_STEPS + STEPS {

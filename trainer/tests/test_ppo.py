@@ -88,6 +88,24 @@ def test_an_update_of_the_policy_ends_at_the_largest_divergence() -> None:
     assert [int(ppo.updater.moments()["value.steps"]) for ppo in (free, held)] == [32, 32]
 
 
+def test_the_value_network_can_learn_alone_first() -> None:
+    free, held = fresh(**TOY), fresh(**TOY, value_updates=2)
+    drawn = {name: tensor.clone() for name, tensor in held.updater.parameters().items()}
+    train(free, 2)
+    train(held, 2)
+    after, of_free = held.updater.parameters(), free.updater.parameters()
+    for name, tensor in drawn.items():
+        is_of_policy = name.startswith("policy.")
+        assert torch.equal(after[name], tensor) == is_of_policy, name
+    # Both saw the same first samples, and others since: those of the free one follow its policy.
+    assert any(not torch.equal(after[name], of_free[name]) for name in after if name.startswith("value."))
+    moments = held.updater.moments()
+    assert int(moments["policy.steps"]) == 0 and int(moments["value.steps"]) == 64
+    assert not moments["policy.mean"].any() and moments["value.mean"].any()
+    train(held, 1)
+    assert not any(torch.equal(after[name], drawn[name]) for name in drawn if name.startswith("policy."))
+
+
 def test_clipped_values_by_hand() -> None:
     value, target = torch.tensor([1.0, 3.0, -1.0, 1.4]), torch.tensor([2.0, 2.0, 2.0, 2.0])
     before = torch.tensor([1.0, 1.0, 1.0, 1.0])

@@ -30,6 +30,7 @@ EXTRAS = [
     {},
     {"value_clip": 0.05},
     {"target_kl": 1e-3},
+    {"value_updates": 1},
     {"actions_per_observation": 4, "value_clip": 0.05},
     {"discount": 0.9},
     {"learning_rate_final": 0.0, "clip_epsilon_final": 0.05, "entropy_scale_final": 0.5},

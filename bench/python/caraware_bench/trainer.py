@@ -115,6 +115,7 @@ def learner_config(
         value_scale=1.0,
         value_clip=None,
         target_kl=None,
+        value_updates=0,
         max_grad_norm=0.5,
         actions_per_observation=1,
         horizon=HORIZON,

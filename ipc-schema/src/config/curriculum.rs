@@ -5,7 +5,7 @@ use std::{fmt, path::PathBuf, str::FromStr};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Config, TrafficConfig,
+    Config, HeroTurns, OWN_TRAINER, TrafficConfig,
     text::{optional_path, serde_as_text},
 };
 use crate::{metric::PolicyMetric, sensor::SENSORS};
@@ -154,8 +154,27 @@ pub enum MapChoice {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
-    /// Connected vehicles kept alive.
-    pub cavs: u32,
+    /// Connected vehicles kept alive; none = `traffic.cavs`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cavs: Option<u32>,
+    /// Vehicles without sensors kept alive; none = `traffic.others`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub others: Option<u32>,
+    /// Pedestrians kept alive; none = `traffic.pedestrians`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pedestrians: Option<u32>,
+    /// Heroes kept alive; none = `traffic.heroes`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heroes: Option<u32>,
+    /// Routes of heroes; none = `traffic.hero_turns`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hero_turns: Option<HeroTurns>,
+    /// Whether traffic lights are on; none = `traffic.traffic_lights`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub traffic_lights: Option<bool>,
+    /// Factor on speed limits; none = `traffic.speed_limit_factor`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub speed_limit_factor: Option<f64>,
     /// Ticks in a lesson; none = `episode.ticks`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ticks: Option<u64>,
@@ -188,6 +207,29 @@ pub struct StageConfig {
     pub until_lessons: Option<u64>,
 }
 
+impl StageConfig {
+    /// True if it can end by what a learner has learnt, and not by the number of lessons alone.
+    #[must_use]
+    pub fn depends_on_learning(&self) -> bool {
+        self.until_std.is_some() || self.until_metric.is_some()
+    }
+
+    /// The traffic of this stage, in a run with `traffic`.
+    #[must_use]
+    pub fn traffic(&self, traffic: &TrafficConfig) -> TrafficConfig {
+        TrafficConfig {
+            cavs: self.cavs.unwrap_or(traffic.cavs),
+            others: self.others.unwrap_or(traffic.others),
+            pedestrians: self.pedestrians.unwrap_or(traffic.pedestrians),
+            heroes: self.heroes.unwrap_or(traffic.heroes),
+            hero_turns: self.hero_turns.unwrap_or(traffic.hero_turns),
+            traffic_lights: self.traffic_lights.unwrap_or(traffic.traffic_lights),
+            speed_limit_factor: self.speed_limit_factor.unwrap_or(traffic.speed_limit_factor),
+            ..traffic.clone()
+        }
+    }
+}
+
 fn is_default(choice: &MapChoice) -> bool {
     *choice == MapChoice::default()
 }
@@ -201,6 +243,20 @@ fn one() -> f64 {
 }
 
 impl Config {
+    /// True if the trainer decides which stage of the curriculum a lesson belongs to. Where several learn, or one in several
+    /// environments, each environment counts its own lessons; so it does for a trainer that knows nothing of lessons.
+    #[must_use]
+    pub fn trainer_decides_lessons(&self) -> bool {
+        let is_alone = self.run.envs == 1 && self.trainer.ranks <= 1;
+        !self.curriculum.stages.is_empty() && is_alone && self.trainer.module == OWN_TRAINER
+    }
+
+    /// The traffic of the base configuration and of each stage.
+    pub fn traffic_of_stages(&self) -> impl Iterator<Item = TrafficConfig> {
+        let stages = self.curriculum.stages.iter();
+        std::iter::once(self.traffic.clone()).chain(stages.map(|stage| stage.traffic(&self.traffic)))
+    }
+
     /// This configuration in `stage` of the curriculum (counted from 1); 0 is the configuration itself.
     #[must_use]
     pub fn in_stage(&self, stage: usize) -> Self {
@@ -208,10 +264,7 @@ impl Config {
         let Some(stage) = stage.checked_sub(1).and_then(|index| self.curriculum.stages.get(index)) else {
             return config;
         };
-        config.traffic = TrafficConfig {
-            cavs: stage.cavs,
-            ..config.traffic
-        };
+        config.traffic = stage.traffic(&config.traffic);
         for sensor in &SENSORS {
             (sensor.scale_noise)(&mut config, stage.noise);
             (sensor.scale_blackouts)(&mut config, stage.blackout);

@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::text::serde_as_text;
 
+/// The learner that comes with caraware.
+pub const OWN_TRAINER: &str = "caraware.train";
+
 /// The learner: PPO with the paper's hyper-parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -38,6 +41,9 @@ pub struct TrainerConfig {
     pub value_clip: Option<f64>,
     /// KL divergence at which an update of the policy ends; `None`: after all epochs.
     pub target_kl: Option<f64>,
+    /// First updates in which the policy keeps its parameters.
+    #[serde(default)]
+    pub value_updates: u64,
     /// Largest norm of the gradient.
     pub max_grad_norm: f64,
     /// Actions tried on every observation.

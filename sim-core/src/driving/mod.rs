@@ -152,6 +152,11 @@ impl<G: DrivableGround> DrivingTask<G> {
         }
     }
 
+    /// The ground of the map that the next episode is on.
+    pub fn set_ground(&mut self, ground: G) {
+        self.ground = ground;
+    }
+
     /// Counts so far.
     #[must_use]
     pub fn counts(&self) -> HeroCounts {

@@ -57,6 +57,11 @@ impl HeroPorts {
         })
     }
 
+    /// Goes to the map of the next episode.
+    pub fn enter_map(&mut self, scene: Arc<Scene>) {
+        self.driving.set_ground(scene);
+    }
+
     /// Counts so far.
     #[must_use]
     pub fn counts(&self) -> HeroCounts {

@@ -125,7 +125,10 @@ impl HeroSurroundings<'_> {
                 None => [SIGHT_M as f32, 1.0, LONGEST_GAP_S as f32],
                 Some(crossing) => {
                     let stop = self.stop_line(crossing).and_then(letter);
-                    let has_right_of_way = stop.map_or(crossing.has_right_of_way, |letter| letter == b'G');
+                    let has_right_of_way = match stop {
+                        Some(letter) if !is_off(letter) => letter == b'G',
+                        _ => crossing.has_right_of_way,
+                    };
                     [
                         (crossing.from_m - self.front_station_m).max(0.0) as f32,
                         f32::from(u8::from(has_right_of_way)),
@@ -170,7 +173,8 @@ impl HeroSurroundings<'_> {
 
     fn write_lights(&self, letter: &impl Fn(&StopLine) -> Option<u8>, numbers: &mut [f32]) {
         let is_ahead = |stop: &&StopLine| {
-            stop.station_m >= self.front_station_m && stop.station_m - self.front_station_m < SIGHT_M
+            let ahead_m = stop.station_m - self.front_station_m;
+            (0.0..SIGHT_M).contains(&ahead_m) && !letter(stop).is_some_and(is_off)
         };
         let mut stops = self.route.stop_lines().iter().filter(is_ahead);
         for row in numbers.as_chunks_mut::<SIGNAL_COLUMNS>().0 {
@@ -228,6 +232,11 @@ fn nearest_users<'a>(vehicles: &'a [Neighbour<'a>]) -> [Option<&'a Neighbour<'a>
         }
     }
     nearest
+}
+
+/// True for a link whose traffic light is off, blinking or not.
+fn is_off(letter: u8) -> bool {
+    matches!(letter, b'o' | b'O')
 }
 
 #[cfg(test)]
@@ -342,9 +351,22 @@ mod tests {
     fn lights_decide_right_of_way_and_persons_are_seen_beside_the_route() {
         let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
         let person = user(Kind::Person, [80.0, -4.0], std::f64::consts::FRAC_PI_2, 1.5);
-        for (letter, priority, green) in [(b'G', 1.0, 1.0), (b'g', 0.0, 1.0), (b'y', 0.0, 0.5), (b'r', 0.0, 0.0)] {
+        // The junction gives the hero no precedence, and lights that are off change nothing.
+        for (letter, priority, light) in [
+            (b'G', 1.0, [40.0, 1.0]),
+            (b'g', 0.0, [40.0, 1.0]),
+            (b'y', 0.0, [40.0, 0.5]),
+            (b'r', 0.0, [40.0, 0.0]),
+            (b'o', 0.0, [100.0, 1.0]),
+            (b'O', 0.0, [100.0, 1.0]),
+        ] {
             let numbers = seen(&[hero, person], Some(letter));
-            assert_eq!((numbers[65], numbers[73], numbers[74]), (priority, 40.0, green));
+            assert_eq!(
+                (numbers[65], [numbers[73], numbers[74]]),
+                (priority, light),
+                "{}",
+                letter as char
+            );
             assert_eq!(numbers[77..80], [20.0, -4.0, 1.5]);
             assert_eq!(numbers[0], 50.0, "a person is no vehicle");
         }

@@ -146,7 +146,13 @@ pub const ROADSIDE_UNIT_KEYS: &[ConfigKey] = &[
 /// Keys of a stage of the curriculum.
 #[rustfmt::skip]
 pub const STAGE_KEYS: &[ConfigKey] = &[
-    integer("curriculum.stages.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this stage."),
+    ConfigKey { optional: true, ..integer("curriculum.stages.cavs", "vehicles", 0, 100_000, "Connected vehicles kept alive in this stage. Unset = `traffic.cavs`.") },
+    ConfigKey { optional: true, ..integer("curriculum.stages.others", "vehicles", 0, 100_000, "Vehicles without sensors kept alive. Unset = `traffic.others`.") },
+    ConfigKey { optional: true, ..integer("curriculum.stages.pedestrians", "persons", 0, 100_000, "Pedestrians kept alive. Unset = `traffic.pedestrians`.") },
+    ConfigKey { optional: true, ..integer("curriculum.stages.heroes", "vehicles", 0, 1000, "Heroes kept alive (driving task). Unset = `traffic.heroes`.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.hero_turns", ValueKind::Choice(&["any", "left"]), "Routes of heroes. Unset = `traffic.hero_turns`.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.traffic_lights", ValueKind::Flag, "Whether traffic lights are on. Unset = `traffic.traffic_lights`.") },
+    optional("curriculum.stages.speed_limit_factor", "", 0.1, 2.0, "Factor on all speed limits. Unset = `traffic.speed_limit_factor`."),
     ConfigKey { optional: true, ..integer("curriculum.stages.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
     ConfigKey { optional: true, ..other("curriculum.stages.restart", ValueKind::Flag, "True: every lesson begins with all vehicles at new random places. False: it continues where the one before ended. Unset = true.") },
     ConfigKey { optional: true, ..other("curriculum.stages.maps", ValueKind::Texts, "Maps of its lessons, by the names in `curriculum.maps`: a file's name without its ending (\"city\" for \"nets/city.net.xml\"). Unset = the first.") },
@@ -249,6 +255,9 @@ pub const KEYS: &[ConfigKey] = &[
     integer("traffic.pedestrians", "persons", 0, 100_000, "Pedestrians kept alive (maps with population control)."),
     integer("traffic.heroes", "vehicles", 0, 1000, "Heroes, driven by actions, kept alive (maps with population control; driving task only)."),
     other("traffic.hero_route", ValueKind::Texts, "Edges of the route of every hero, from its first to its last (maps with population control); [] = at random."),
+    other("traffic.hero_turns", ValueKind::Choice(&["any", "left"]), "Routes of heroes that are drawn at random: any, or those with at least one left turn at a junction that has other ways, too (maps with population control)."),
+    other("traffic.traffic_lights", ValueKind::Flag, "Traffic lights are on. False = all are off, and vehicles give way by the rules of the junction (maps with population control)."),
+    float("traffic.speed_limit_factor", "", 0.1, 2.0, "Factor on all speed limits (maps with population control)."),
     other("traffic.hero_ids", ValueKind::Texts, "Ids of the vehicles of a `.sumocfg` that are heroes, driven by actions (driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
     integer("traffic.max_cavs", "vehicles", 0, 100_000, "Limit of vehicles with sensors at a time: a departing vehicle gets sensors while fewer are on the road; 0 = no limit."),
@@ -484,6 +493,7 @@ pub const KEYS: &[ConfigKey] = &[
     float("trainer.value_scale", "", 0.0, 100.0, "Weight of the value loss."),
     optional("trainer.value_clip", "", 0.0, 1e6, "Largest change of a value in one update; unset = unbounded."),
     optional("trainer.target_kl", "", 1e-9, 1e6, "An update of the policy ends with the first epoch whose mean KL divergence from the policy before the update is larger; unset = all epochs."),
+    integer("trainer.value_updates", "updates", 0, 1_000_000, "Updates at the beginning that teach the value network alone, while the policy keeps its parameters: for a policy that begins from a file without a value network (`task.begin_from`). A policy that follows the advantages of an untrained one unlearns."),
     float("trainer.max_grad_norm", "", 0.0001, 1e6, "Largest norm of the gradient."),
     integer("trainer.actions_per_observation", "", 1, 1024, "Actions tried on every observation (`trainer.discount` = 0 only). Predictions do not influence the world, so the reward of each is known, and more of them make the gradient less noisy at little cost. An even number is drawn in pairs on both sides of the mean."),
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),

@@ -2,7 +2,9 @@
 
 use ipc_schema::{
     channel::Channel,
-    config::{Config, HeroDriver, Network, TaskKind, TrafficEngine, V2xInclusion, VehicleModel},
+    config::{
+        Config, HeroDriver, HeroTurns, Network, OWN_TRAINER, TaskKind, TrafficEngine, V2xInclusion, VehicleModel,
+    },
 };
 
 mod curriculum;
@@ -91,9 +93,6 @@ fn recorded_channels(settings: &LayeredSettings, config: &Config) -> Result<(), 
         None => Ok(()),
     }
 }
-
-/// The learner that comes with caraware.
-pub const OWN_TRAINER: &str = "caraware.train";
 
 /// Heroes need the driving task, and the driving task needs heroes.
 fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
@@ -200,6 +199,13 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "traffic.step_s",
             format!("`traffic.step_s` = {step_s} s is not `run.tick_s` = {tick_s} s, as the driving task needs"),
             "set both to the same time, such as 0.1: an action reaches SUMO within a tick",
+        ));
+    }
+    if config.traffic.hero_turns != HeroTurns::Any && !config.traffic.hero_route.is_empty() {
+        return Some((
+            "traffic.hero_turns",
+            "`traffic.hero_turns` is for routes that are drawn, and `traffic.hero_route` gives one".into(),
+            "set traffic.hero_route = [], or traffic.hero_turns = \"any\"",
         ));
     }
     if config.vehicle.preview_s > 0.0 {

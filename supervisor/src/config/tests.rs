@@ -1,5 +1,5 @@
 use super::*;
-use ipc_schema::sensor::SensorKind;
+use ipc_schema::{config::HeroTurns, sensor::SensorKind};
 
 fn config_of(text: &str) -> Result<Config, ConfigError> {
     layer::parse("my.toml", text).and_then(|layer| {
@@ -381,18 +381,26 @@ fn a_stage_of_a_curriculum_is_checked_value_by_value() {
     let steps = config.curriculum.stages;
     assert_eq!(
         (steps.len(), steps[0].restart, steps[1].restart, steps[1].cavs),
-        (2, false, true, 8)
+        (2, false, true, Some(8))
     );
     assert_eq!((steps[0].until_std, steps[1].noise), (Some(0.5), 1.0));
     let (message, help) = error_of("[[curriculum.stages]]\ncavs = 1\nuntil_sigma = 0.5\n");
     assert_eq!(message, "my.toml:3: unknown key `curriculum.stages.until_sigma`");
     assert!(help.contains("`curriculum.stages.until_std`"), "{help}");
     let (message, _) = error_of("[curriculum]\nstages = [{ cavs = 0 }]\n");
-    assert_eq!(message, "my.toml:2: `curriculum.stages.cavs` cannot be 0");
-    let (message, _) = error_of("[[curriculum.stages]]\nrestart = true\n");
-    assert!(
-        message.contains("entry 1 of `curriculum.stages` has no `cavs`"),
-        "{message}"
+    assert_eq!(
+        message,
+        "my.toml:2: stage 1 of `curriculum.stages` has no connected vehicle for the localisation task"
+    );
+    let (message, _) = error_of("[[curriculum.stages]]\nspeed_limit_factor = 3.0\n");
+    assert_eq!(
+        message,
+        "my.toml:2: `curriculum.stages.speed_limit_factor` cannot be 3.0"
+    );
+    let (message, _) = error_of("[[curriculum.stages]]\nheroes = 3\n");
+    assert_eq!(
+        message,
+        "my.toml:2: stage 1 of `curriculum.stages` sets heroes, which need the driving task"
     );
     let (message, help) = error_of("traffic.max_road_users = 60\n[[curriculum.stages]]\ncavs = 100\n");
     assert!(
@@ -400,6 +408,58 @@ fn a_stage_of_a_curriculum_is_checked_value_by_value() {
         "{message}"
     );
     assert_eq!(help, "set traffic.max_road_users to 120 or more");
+}
+
+/// What a stage leaves out is as in the configuration.
+#[test]
+fn a_stage_of_the_driving_task_sets_what_heroes_learn_to_drive_through() {
+    let driving = "task.kind = \"driving\"\ntraffic.cavs = 0\ntraffic.heroes = 2\ntrainer.network = \"mlp\"\ntrainer.actions_per_observation = 1\n";
+    let with = |lines: &str| format!("{driving}{lines}");
+    let stages = "[[curriculum.stages]]\nothers = 0\nspeed_limit_factor = 0.5\n[[curriculum.stages]]\nheroes = 5\nhero_turns = \"left\"\ntraffic_lights = false\n";
+    let config = config_of(&with(stages)).unwrap();
+    assert!(config.trainer_decides_lessons());
+    assert_eq!(config.heroes(), 5, "there is room for the most heroes of a stage");
+    let of_stage = |number: usize| {
+        let traffic = config.in_stage(number).traffic;
+        (
+            (traffic.cavs, traffic.others, traffic.pedestrians, traffic.heroes),
+            (traffic.hero_turns, traffic.traffic_lights, traffic.speed_limit_factor),
+        )
+    };
+    assert_eq!(of_stage(0), ((0, 8, 12, 2), (HeroTurns::Any, true, 1.0)));
+    assert_eq!(of_stage(1), ((0, 0, 12, 2), (HeroTurns::Any, true, 0.5)));
+    assert_eq!(of_stage(2), ((0, 8, 12, 5), (HeroTurns::Left, false, 1.0)));
+
+    let (message, _) = error_of(&with("[[curriculum.stages]]\nheroes = 0\n"));
+    assert_eq!(
+        message,
+        "my.toml:7: stage 1 of `curriculum.stages` has no hero to teach"
+    );
+    let along = "traffic.hero_route = [\"a\"]\n[[curriculum.stages]]\nhero_turns = \"left\"\n";
+    let (message, _) = error_of(&with(along));
+    assert!(message.contains("`traffic.hero_route` gives one"), "{message}");
+    let (message, _) = error_of(&with("traffic.hero_route = [\"a\"]\ntraffic.hero_turns = \"left\"\n"));
+    assert!(message.contains("`traffic.hero_route` gives one"), "{message}");
+}
+
+/// Nobody could decide for several environments or trainers at once.
+#[test]
+fn several_environments_count_the_lessons_of_a_stage() {
+    let envs = "run.envs = 2\n";
+    let config = config_of(&format!("{envs}[[curriculum.stages]]\ncavs = 1\nuntil_lessons = 3\n")).unwrap();
+    assert!(!config.trainer_decides_lessons());
+    for (who, key, value) in [
+        (envs, "until_std", "0.5"),
+        (envs, "until_metric", "\"error_m\"\nuntil_value = 6.0"),
+        (envs, "restart", "false"),
+        ("trainer.ranks = 2\n", "until_std", "0.5"),
+        ("trainer.module = \"mine\"\n", "until_std", "0.5"),
+    ] {
+        let (message, help) = error_of(&format!("{who}[[curriculum.stages]]\ncavs = 1\n{key} = {value}\n"));
+        let expected = format!("my.toml:4: stage 1 of `curriculum.stages`: `{key}` needs one trainer that decides");
+        assert!(message.starts_with(&expected), "{message}");
+        assert!(help.contains("\"caraware.train\""), "{help}");
+    }
 }
 
 #[test]

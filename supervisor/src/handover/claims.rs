@@ -62,7 +62,7 @@ impl SuccessorClaims {
             self.environments,
             config.run.envs,
         )?;
-        if self.decides_lessons == Some(false) && !config.curriculum.stages.is_empty() {
+        if self.decides_lessons == Some(false) && config.trainer_decides_lessons() {
             return Err("it decides no lessons, and the run has a curriculum that waits for them".into());
         }
         match self.first_tick {

@@ -257,6 +257,84 @@ fn lessons_are_on_the_maps_of_their_stages_and_the_same_seed_gives_the_same_byte
     workplace.assert_nothing_left();
 }
 
+/// Two environments count their lessons, each on maps of its own.
+const DRIVEN: [&str; 14] = [
+    "curriculum.maps=[\"town\",\"city/city.sumocfg\"]",
+    "curriculum.stages=[{others=0,pedestrians=0,speed_limit_factor=0.5,until_lessons=1},\
+     {heroes=6,hero_turns=\"left\",traffic_lights=false,maps=[\"town\",\"city\"],map_choice=\"random\"}]",
+    "run.envs=2",
+    "traffic.heroes=4",
+    "episode.ticks=60",
+    "episode.training_episodes=5",
+    "episode.evaluation_interval=0",
+    "episode.evaluation_ticks=40",
+    "trainer.value_updates=2",
+    "trainer.horizon=512",
+    "trainer.batch_size=256",
+    "trainer.matmul_precision=float32",
+    "trainer.checkpoint_interval=1",
+    "fanout.enabled=false",
+];
+
+/// Heroes on a map are judged by its roads, and a death changes nothing.
+#[test]
+fn heroes_learn_stage_by_stage_in_several_environments() {
+    let workplace = with_city();
+    let driver = concat!(
+        "task.begin_from=",
+        env!("CARGO_MANIFEST_DIR"),
+        "/../maps/town/driver.safetensors"
+    );
+    let settings = DRIVEN.iter().chain([&driver]).flat_map(|setting| ["--set", setting]);
+    let train = |name| -> Vec<&str> {
+        let named = ["train", "driving", "--name", name].into_iter();
+        named.chain(settings.clone()).collect()
+    };
+    workplace.succeed(&train("whole"));
+    let report = workplace.report("whole");
+    for environment in report["environments"].as_array().unwrap() {
+        let heroes = &environment["dynamics"]["heroes"];
+        // The first stage and the evaluation have four, each other lesson six. On another map's roads all would be beside them.
+        let [episodes, off_road] = ["episodes", "off_road"].map(|name| heroes[name].as_u64().unwrap());
+        assert!(episodes >= 4 + 4 * 6 + 4 && 4 * off_road < episodes, "{heroes}");
+    }
+    assert_eq!(report["ticks"], 2 * (5 * 60 + 40));
+    let stages = decisions(&workplace, "whole");
+    assert_eq!(stages, [[0, 0, 0], [1, 1, 60]]);
+    assert_eq!(decisions(&workplace, "whole/env-1"), stages);
+    let maps = &report["traffic"]["maps"];
+    let lessons = |map: usize| maps[map]["lessons"].as_u64().unwrap();
+    assert_eq!(lessons(0) + lessons(1), 5, "{maps}");
+    let of_each = [0, 1].map(|index| lessons_of_environment(&workplace, "whole", index));
+    assert_eq!([lessons(0), lessons(1)], of_each[0]);
+    assert!(of_each.iter().all(|[town, _]| *town > 0), "{of_each:?}");
+    assert!(of_each.iter().any(|[_, city]| *city > 0), "{of_each:?}");
+
+    let mut child = workplace.command(&train("killed")).spawn().unwrap();
+    let run = trainer_of(&workplace, "killed", &mut child);
+    kill_trainer(&run.1, 0, 130);
+    drop(run);
+    assert!(child.wait().unwrap().success());
+    let killed = workplace.report("killed");
+    assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &1.into()));
+    for index in 0..2 {
+        let hash = |report: &Value| report["environments"][index]["observation_hash"].clone();
+        assert_eq!(hash(&killed), hash(&report), "environment {index}");
+    }
+    workplace.assert_nothing_left();
+}
+
+/// Lessons by map of an environment, by configuration and seed.
+fn lessons_of_environment(workplace: &Workplace, name: &str, index: u32) -> [u64; 2] {
+    let run = RunFile::read(&workplace.path().join("runs").join(name).join("run.json")).unwrap();
+    let mut plan = run.environment(index).curriculum_plan().unwrap();
+    let mut lessons = [0; 2];
+    for stage in [0, 1, 1, 1, 1] {
+        lessons[plan.enter(stage).unwrap().map] += 1;
+    }
+    lessons
+}
+
 /// True if a position is on a street of the generated grid: lines 300 m apart.
 fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
     let off_m = |place_m: f32| (place_m - 300.0 * (place_m / 300.0).round()).abs();

@@ -1,5 +1,5 @@
 //! Which stage of the curriculum a lesson belongs to. The trainer decides; without a trainer the log of an earlier run does, or
-//! the number of lessons.
+//! the number of lessons, which also decides where several learn or one does in several environments.
 
 use std::{
     fs::File,
@@ -56,12 +56,16 @@ impl StageDecisions {
         let curriculum = &run.config.curriculum;
         let path = run.run_dir.join(CURRICULUM_LOG);
         let source = match (run.mode, &curriculum.log) {
-            (Mode::Train, _) => StageSource::Trainer(membership.board_of(Process::Trainer)?),
-            (Mode::Simulate | Mode::Play, None) => StageSource::Count(curriculum.stages.clone()),
+            (Mode::Train, _) if run.config.trainer_decides_lessons() => {
+                StageSource::Trainer(membership.board_of(Process::Trainer)?)
+            }
+            (Mode::Train, _) | (Mode::Simulate | Mode::Play, None) => StageSource::Count(curriculum.stages.clone()),
             (Mode::Simulate | Mode::Play, Some(path)) => StageSource::Log(read(path)?),
         };
         let is_restart = run.restart.is_some();
-        let mut kept = match run.beginning.is_some() || is_restart && path.exists() {
+        // Where lessons are counted, nothing has to be known of those before.
+        let is_needed = run.beginning.is_some() && !matches!(source, StageSource::Count(_));
+        let mut kept = match is_needed || is_restart && path.exists() {
             true => read(&path)?,
             false => Vec::new(),
         };
@@ -82,7 +86,10 @@ impl StageDecisions {
 
     /// The stage, counted from 0, of `lesson`, which is in the checkpoint that the run resumes from.
     pub(crate) fn stage_in_checkpoint(&self, lesson: u64) -> usize {
-        logged(&self.kept, lesson)
+        match &self.source {
+            StageSource::Count(stages) => counted(stages, lesson),
+            StageSource::Trainer(_) | StageSource::Log(_) => logged(&self.kept, lesson),
+        }
     }
 
     /// The stage, counted from 0, of `lesson`, which would begin with `tick`; waits for the trainer's decision. `None`: the process

@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     activity::Awaited,
-    config::TrafficEngine,
+    config::{TrafficConfig, TrafficEngine},
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
@@ -17,7 +17,7 @@ use ipc_schema::{
 use super::{Bridge, EpisodeCounts, commands::CommandContext};
 use crate::{
     heroes,
-    population::{Population, PopulationSize, trips::TripSelection},
+    population::{HeroRoutes, Population, PopulationSize, trips::TripSelection},
     sumo::{
         Sumo,
         connected::ConnectedRule,
@@ -85,13 +85,13 @@ pub(super) enum EpisodeEnd {
 }
 
 /// SUMO's options for `episode`.
-fn options(run: &RunFile, map: &RunMap, episode: &Episode) -> Result<SumoOptions, SumoError> {
-    let traffic = &run.config.traffic;
+fn options(run: &RunFile, map: &RunMap, episode: &Episode, traffic: &TrafficConfig) -> Result<SumoOptions, SumoError> {
     let options = match &map.source {
         Source::Population {
             net_file,
             additional_files,
-        } => SumoOptions::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed),
+        } => SumoOptions::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed)
+            .map(|options| options.with_traffic_lights(traffic.traffic_lights)),
         Source::Scenario { sumocfg, own } => {
             let output_dir = run.run_dir.join("sumo");
             let rule = ConnectedRule::Scenario {
@@ -150,14 +150,14 @@ fn population(
     run: &RunFile,
     sumo: &mut Sumo,
     episode: &Episode,
-    stage: usize,
+    traffic: &TrafficConfig,
 ) -> Result<Option<Population>, SumoError> {
     match run.source {
         Source::Population { .. } => {
-            let traffic = &run.config.in_stage(stage).traffic;
+            sumo.scale_speed_limits(traffic.speed_limit_factor)?;
             let trips = TripSelection::of_episode(traffic.held_out_trips, episode.evaluation);
-            let size = PopulationSize::from(traffic);
-            Population::start_on(sumo, size, &traffic.hero_route, trips, episode.seed).map(Some)
+            let (size, heroes) = (PopulationSize::from(traffic), HeroRoutes::from(traffic));
+            Population::start_on(sumo, size, heroes, trips, episode.seed).map(Some)
         }
         Source::Scenario { .. } => Ok(None),
     }
@@ -196,7 +196,8 @@ impl Bridge {
     ) -> Result<RunningEpisode, Failure> {
         self.store_state(episode)?;
         let run = &self.membership.run;
-        let options = options(run, &self.maps[map], episode)?;
+        let traffic = run.config.in_stage(stage).traffic;
+        let options = options(run, &self.maps[map], episode, &traffic)?;
         // A file may crash SUMO, which cannot be caught: the failure is written before, and removed when SUMO has read the files.
         options.crashed().write(&run.run_dir, Process::TrafficBridge.name());
         let mut sumo = match before {
@@ -204,7 +205,7 @@ impl Bridge {
             Some(before) => Sumo::reload(before.sumo, options)?,
         };
         Failure::remove(&run.run_dir, Process::TrafficBridge.name());
-        let population = population(run, &mut sumo, episode, stage)?;
+        let population = population(run, &mut sumo, episode, &traffic)?;
         let reads_positions = self.outbox.lanes.is_some();
         let lanes = match reads_positions || self.frames_per_step > 1 {
             true => Some(sumo.read_lanes()?),

@@ -15,7 +15,7 @@ pub mod vehicle_types;
 use std::{collections::BTreeMap, rc::Rc};
 
 use ipc_schema::{
-    config::TrafficConfig,
+    config::{HeroTurns, TrafficConfig},
     traffic::{MetaEvent, VehicleMeta},
 };
 use rand_chacha::ChaCha8Rng;
@@ -70,8 +70,8 @@ impl From<&TrafficConfig> for PopulationSize {
 enum DriverTrips {
     /// From one random road to the next, without end.
     Forever,
-    /// To one random road.
-    Once,
+    /// To one random road, by such a route.
+    Once(HeroTurns),
     /// Along these edges.
     Given(Rc<[String]>),
 }
@@ -101,6 +101,24 @@ pub(crate) struct Driver {
     departed: bool,
 }
 
+/// Where heroes drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct HeroRoutes<'a> {
+    /// The edges of every hero's route; none = at random.
+    pub edges: &'a [String],
+    /// Which routes are drawn.
+    pub turns: HeroTurns,
+}
+
+impl<'a> From<&'a TrafficConfig> for HeroRoutes<'a> {
+    fn from(traffic: &'a TrafficConfig) -> Self {
+        Self {
+            edges: &traffic.hero_route,
+            turns: traffic.hero_turns,
+        }
+    }
+}
+
 /// The road users of one episode.
 #[derive(Debug)]
 pub struct Population {
@@ -115,15 +133,14 @@ impl Population {
     /// Adds all road users at random positions of a `sumo` that has just started; they depart within the first two seconds.
     ///
     /// # Errors
-    /// The net has no connected roads for a vehicle class in use, or no sidewalks for pedestrians, or no route along
-    /// `hero_route` (the edges of every hero's route; none = at random).
+    /// The net has no connected roads for a vehicle class in use, or no sidewalks for pedestrians, or no route along those of `heroes`.
     pub fn start(
         sumo: &mut Sumo,
         size: PopulationSize,
-        hero_route: &[String],
+        heroes: HeroRoutes<'_>,
         episode_seed: u64,
     ) -> Result<Self, SumoError> {
-        Self::start_on(sumo, size, hero_route, TripSelection::ANY, episode_seed)
+        Self::start_on(sumo, size, heroes, TripSelection::ANY, episode_seed)
     }
 
     /// [`Self::start`] with vehicles that make only these trips, as far as random draws find them.
@@ -133,7 +150,7 @@ impl Population {
     pub fn start_on(
         sumo: &mut Sumo,
         size: PopulationSize,
-        hero_route: &[String],
+        heroes: HeroRoutes<'_>,
         trips: TripSelection,
         episode_seed: u64,
     ) -> Result<Self, SumoError> {
@@ -141,7 +158,7 @@ impl Population {
         let pedestrians = Pedestrians::start(sumo, size.pedestrians, &catalogue.pedestrians, episode_seed)?;
         let pace = CareSchedule::new(sumo.step_s());
         let (place_of, next_number) = (BTreeMap::new(), BTreeMap::new());
-        let drivers = drivers(sumo, size, hero_route, trips, &catalogue, episode_seed)?;
+        let drivers = drivers(sumo, size, heroes, trips, &catalogue, episode_seed)?;
         let mut population = Self {
             drivers,
             place_of,
@@ -240,10 +257,12 @@ impl Driver {
 
     /// A random destination on an allowed trip; any road if the draws find none.
     fn draw_goal(&mut self, from: usize) -> usize {
+        let turns_left = matches!(self.way, DriverTrips::Once(HeroTurns::Left));
         let mut goal = from;
         for _ in 0..DRAWS_OF_A_TRIP {
             goal = self.roads.draw_other(from, &mut self.rng);
-            if self.trips.allow(&self.roads.edge(from).id, &self.roads.edge(goal).id) {
+            let is_allowed = self.trips.allow(&self.roads.edge(from).id, &self.roads.edge(goal).id);
+            if is_allowed && (!turns_left || self.roads.turns_left(from, goal)) {
                 break;
             }
         }
@@ -276,13 +295,13 @@ impl Driver {
 fn drivers(
     sumo: &Sumo,
     size: PopulationSize,
-    hero_route: &[String],
+    heroes: HeroRoutes<'_>,
     trips: TripSelection,
     catalogue: &TypeCatalogue,
     episode_seed: u64,
 ) -> Result<Vec<Driver>, SumoError> {
-    let hero_way = match hero_route {
-        [] => DriverTrips::Once,
+    let hero_way = match heroes.edges {
+        [] => DriverTrips::Once(heroes.turns),
         edges => DriverTrips::Given(edges.into()),
     };
     let hero_types: Vec<WeightedType> = catalogue

@@ -1,6 +1,6 @@
 //! Where a class of vehicles can drive without end: the largest part of the net in which every road leads to every other.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rand_chacha::ChaCha8Rng;
 
@@ -31,6 +31,8 @@ pub struct RoadEdge {
 pub struct Roads {
     edges: Vec<RoadEdge>,
     successors: Vec<Vec<usize>>,
+    /// Pairs of roads with a left turn from the first to the second.
+    left_turns: BTreeSet<[usize; 2]>,
     travel_time_ms: Vec<u64>,
     total_length_m: f64,
 }
@@ -43,7 +45,7 @@ impl Roads {
     pub fn connected(sumo: &Sumo, class: &str) -> Result<Self, SumoError> {
         let edges = usable(sumo, class)?;
         let links = called("list links", sumo.simulation().links(class))?;
-        let component = largest_component(&successors(&edges, &links));
+        let component = largest_component(&successors(&edges, &links).0);
         let edges = component.into_iter().map(|index| edges[index].clone()).collect();
         Self::new(sumo, class, edges, &links)
     }
@@ -68,8 +70,10 @@ impl Roads {
                 found: edges.len(),
             });
         }
+        let (successors, left_turns) = successors(&edges, links);
         Ok(Self {
-            successors: successors(&edges, links),
+            successors,
+            left_turns,
             travel_time_ms: edges.iter().map(|edge| edge.travel_time_ms).collect(),
             total_length_m: edges.iter().map(|edge| edge.length_m).sum(),
             edges,
@@ -91,8 +95,20 @@ impl Roads {
     /// SUMO's ids of the fastest route, both ends included.
     #[must_use]
     pub fn route(&self, from: usize, to: usize) -> Vec<String> {
-        let path = cheapest_path(&self.successors, &self.travel_time_ms, from, to);
-        path.into_iter().map(|index| self.edges[index].id.clone()).collect()
+        let path = self.path(from, to).into_iter();
+        path.map(|index| self.edges[index].id.clone()).collect()
+    }
+
+    /// True if the fastest route turns left at a junction at which it could have turned elsewhere.
+    #[must_use]
+    pub fn turns_left(&self, from: usize, to: usize) -> bool {
+        let path = self.path(from, to);
+        let is_left = |pair: &[usize; 2]| self.left_turns.contains(pair) && self.successors[pair[0]].len() > 1;
+        path.array_windows().any(is_left)
+    }
+
+    fn path(&self, from: usize, to: usize) -> Vec<usize> {
+        cheapest_path(&self.successors, &self.travel_time_ms, from, to)
     }
 
     /// A random road, drawn in proportion to its length, with room for a vehicle if the draws find one.
@@ -150,19 +166,24 @@ fn milliseconds(seconds: f64) -> u64 {
     milliseconds.clamp(1, 3_600_000)
 }
 
-fn successors(edges: &[RoadEdge], links: &[RawLink]) -> Vec<Vec<usize>> {
+/// The roads that each road leads to, and the pairs between which it turns left.
+fn successors(edges: &[RoadEdge], links: &[RawLink]) -> (Vec<Vec<usize>>, BTreeSet<[usize; 2]>) {
     let index: BTreeMap<&str, usize> = edges
         .iter()
         .enumerate()
         .map(|(i, edge)| (edge.id.as_str(), i))
         .collect();
-    let mut successors = vec![Vec::new(); edges.len()];
+    let (mut successors, mut left_turns) = (vec![Vec::new(); edges.len()], BTreeSet::new());
     for link in links {
-        if let (Some(&from), Some(&to)) = (index.get(link.from.as_str()), index.get(link.to.as_str()))
-            && !successors[from].contains(&to)
-        {
+        let (Some(&from), Some(&to)) = (index.get(link.from.as_str()), index.get(link.to.as_str())) else {
+            continue;
+        };
+        if !successors[from].contains(&to) {
             successors[from].push(to);
         }
+        if link.is_left {
+            left_turns.insert([from, to]);
+        }
     }
-    successors
+    (successors, left_turns)
 }

@@ -69,6 +69,7 @@ public:
     rust::String vehicle_class(rust::Str vehicle_type) const override;
     rust::Vec<RawEdge> edges(rust::Str vehicle_class) const override;
     rust::Vec<RawLink> links(rust::Str vehicle_class) const override;
+    void scale_speed_limits(double factor) override;
 
     void add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) override;
     void remove_vehicle(rust::Str id) override;

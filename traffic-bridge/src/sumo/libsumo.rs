@@ -109,6 +109,8 @@ pub mod ffi {
     struct RawLink {
         from: String,
         to: String,
+        /// It turns left.
+        is_left: bool,
     }
 
     /// A lane on a vehicle's route.
@@ -202,6 +204,8 @@ pub mod ffi {
         fn vehicle_class(self: &Simulation, vehicle_type: &str) -> Result<String>;
         fn edges(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawEdge>>;
         fn links(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawLink>>;
+        /// Multiplies the speed limits of all lanes.
+        fn scale_speed_limits(self: Pin<&mut Simulation>, factor: f64) -> Result<()>;
 
         /// Adds a vehicle at a free position of the first edge of `route`, at the speed of traffic there.
         fn add_vehicle(self: Pin<&mut Simulation>, id: &str, vehicle_type: &str, route: &[String]) -> Result<()>;

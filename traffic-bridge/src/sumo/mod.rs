@@ -223,6 +223,18 @@ impl Sumo {
         Ok(LaneGraph::new(lanes))
     }
 
+    /// Multiplies the speed limits of all lanes; 1 changes nothing.
+    ///
+    /// # Errors
+    /// SUMO refuses.
+    pub fn scale_speed_limits(&mut self, factor: f64) -> Result<(), SumoError> {
+        #[expect(clippy::float_cmp, reason = "what the user wrote")]
+        if factor == 1.0 {
+            return Ok(());
+        }
+        called("scale speed limits", self.simulation_mut().scale_speed_limits(factor))
+    }
+
     /// From now on frames say where road users are in SUMO's terms ([`TrafficFrame::positions`]). Call [`Sumo::read_lanes`] before, whose
     /// indices they use.
     pub fn read_positions(&mut self) {

@@ -74,6 +74,15 @@ impl SumoOptions {
         })
     }
 
+    /// All traffic lights are on, or off.
+    #[must_use]
+    pub fn with_traffic_lights(mut self, are_on: bool) -> Self {
+        if !are_on {
+            self.arguments.extend(["--tls.all-off".to_owned(), "true".to_owned()]);
+        }
+        self
+    }
+
     /// A user's scenario exactly as SUMO runs it, except for its outputs, which go to `output_dir`. `step_s` and `seed` are
     /// those of the run; they replace the scenario's `own` only if they differ. `rule` says which vehicles are connected or
     /// heroes.

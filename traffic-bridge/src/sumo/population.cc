@@ -40,12 +40,18 @@ rust::Vec<RawLink> EngineSimulation::links(rust::Str vehicle_class) const {
             for (const libsumo::TraCIConnection& link : engine::Lane::getLinks(lane)) {
                 const std::string next = engine::Lane::getEdgeID(link.approachedLane);
                 if (!is_internal(next) && allows(link.approachedLane, species)) {
-                    result.push_back(RawLink{rust::String::lossy(edge), rust::String::lossy(next)});
+                    result.push_back(RawLink{rust::String::lossy(edge), rust::String::lossy(next), link.direction == "l"});
                 }
             }
         }
     }
     return result;
+}
+
+void EngineSimulation::scale_speed_limits(double factor) {
+    for (const std::string& lane : engine::Lane::getIDList()) {
+        engine::Lane::setMaxSpeed(lane, factor * engine::Lane::getMaxSpeed(lane));
+    }
 }
 
 void EngineSimulation::add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) {

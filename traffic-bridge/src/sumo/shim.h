@@ -56,6 +56,7 @@ public:
     virtual rust::String vehicle_class(rust::Str vehicle_type) const = 0;
     virtual rust::Vec<RawEdge> edges(rust::Str vehicle_class) const = 0;
     virtual rust::Vec<RawLink> links(rust::Str vehicle_class) const = 0;
+    virtual void scale_speed_limits(double factor) = 0;
 
     virtual void add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) = 0;
     virtual void remove_vehicle(rust::Str id) = 0;

@@ -9,4 +9,5 @@ mod process;
 mod right_of_way;
 mod scenario;
 mod signals;
+mod stages;
 mod support;

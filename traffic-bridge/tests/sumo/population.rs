@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::traffic::{Kind, MetaEvent};
 use traffic_bridge::{
-    population::{Population, PopulationSize},
+    population::{HeroRoutes, Population, PopulationSize},
     sumo::{Sumo, error::SumoError, options::SumoOptions},
 };
 
@@ -23,7 +23,7 @@ fn options(bench: &Bench, seed: u64) -> SumoOptions {
 
 /// All bytes of all frames of an episode, and the first positions of connected vehicles.
 fn episode(sumo: &mut Sumo, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64, i64)>) {
-    let mut population = Population::start(sumo, SIZE, &[], seed).unwrap();
+    let mut population = Population::start(sumo, SIZE, HeroRoutes::default(), seed).unwrap();
     let (mut bytes, mut places) = (Vec::new(), Vec::new());
     run(sumo, steps, |sumo, frame| {
         bytes.extend_from_slice(bytemuck::cast_slice(&frame.states));
@@ -83,7 +83,7 @@ fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
 fn the_population_keeps_its_size() {
     let bench = Bench::new();
     let mut sumo = Sumo::start(options(&bench, 3)).unwrap();
-    let mut population = Population::start(&mut sumo, SIZE, &[], 3).unwrap();
+    let mut population = Population::start(&mut sumo, SIZE, HeroRoutes::default(), 3).unwrap();
     let (mut arrived, mut edges_of_time) = (0, BTreeSet::new());
     run(&mut sumo, 6000, |sumo, frame| {
         let alive = |kind: Kind| frame.states.iter().filter(|state| state.kind == kind as u32).count();
@@ -127,7 +127,7 @@ fn a_vehicle_that_leaves_is_replaced() {
     let additional = bench.file("end.add.xml", text);
     let options = SumoOptions::population(&sumo_home(), &net, &[additional], STEP_S, 3).unwrap();
     let mut sumo = Sumo::start(options).unwrap();
-    let mut population = Population::start(&mut sumo, SIZE, &[], 3).unwrap();
+    let mut population = Population::start(&mut sumo, SIZE, HeroRoutes::default(), 3).unwrap();
     let (mut arrived, mut names) = (0, BTreeSet::new());
     run(&mut sumo, 3000, |sumo, frame| {
         arrived += frame
@@ -159,7 +159,7 @@ fn a_crowd_finds_room() {
         heroes: 0,
         pedestrians: 0,
     };
-    let mut population = Population::start(&mut sumo, crowd, &[], 3).unwrap();
+    let mut population = Population::start(&mut sumo, crowd, HeroRoutes::default(), 3).unwrap();
     let mut cavs = 0;
     // One vehicle to 20 m of lane: a vehicle that finds no room where it should start is added elsewhere.
     run(&mut sumo, 100, |sumo, frame| {
@@ -176,7 +176,7 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
     let start = |size| {
         let options = SumoOptions::population(&sumo_home(), &net, &[], STEP_S, 1).unwrap();
         let mut sumo = Sumo::start(options).unwrap();
-        Population::start(&mut sumo, size, &[], 1).unwrap_err()
+        Population::start(&mut sumo, size, HeroRoutes::default(), 1).unwrap_err()
     };
     for (size, class) in [
         (

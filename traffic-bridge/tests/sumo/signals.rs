@@ -8,7 +8,7 @@ use std::{
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::traffic::{SIGNAL_LINKS, SignalMeta, id_hash};
 use traffic_bridge::{
-    population::{Population, PopulationSize},
+    population::{HeroRoutes, Population, PopulationSize},
     sumo::{
         Sumo,
         frame::TrafficFrame,
@@ -42,7 +42,7 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
         heroes: 0,
         pedestrians,
     };
-    let mut population = Population::start(&mut sumo, size, &[], 1).unwrap();
+    let mut population = Population::start(&mut sumo, size, HeroRoutes::default(), 1).unwrap();
     let mut now: BTreeMap<String, String> = BTreeMap::new();
     let (mut published, mut changes) = (Vec::new(), 0);
     run(&mut sumo, 400, |sumo: &mut Sumo, frame: &TrafficFrame| {

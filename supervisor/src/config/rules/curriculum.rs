@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 
 use ipc_schema::{
-    config::{Config, CurriculumMap, MapChoice, StageConfig},
+    config::{Config, CurriculumMap, HeroTurns, MapChoice, OWN_TRAINER, StageConfig},
     metric::PolicyMetric,
 };
 
-use super::{ConfigError, LayeredSettings, OWN_TRAINER, conflict, conflict_in_entry};
+use super::{ConfigError, LayeredSettings, conflict, conflict_in_entry};
 
 /// Most stages of a curriculum: each prefetches its maps and keeps statistics of its own.
 const MOST_STAGES: usize = 255;
@@ -15,46 +15,13 @@ const MOST_STAGES: usize = 255;
 const MOST_MAPS: usize = 256;
 
 pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
-    let (stages, traffic) = (&config.curriculum.stages, &config.traffic);
+    let stages = &config.curriculum.stages;
     let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
     if stages.len() > MOST_STAGES {
         return refuse(
             format!("`curriculum.stages` has {} stages", stages.len()),
             format!("give at most {MOST_STAGES}"),
         );
-    }
-    if !stages.is_empty() && config.drives() {
-        return refuse(
-            "a curriculum is for the localisation task: its stages set the number of connected vehicles".into(),
-            "set task.kind = \"localisation\" or curriculum.stages = []".into(),
-        );
-    }
-    if !stages.is_empty() && (config.run.envs > 1 || config.trainer.ranks > 1) {
-        return refuse(
-            "a curriculum needs exactly one trainer and one environment".into(),
-            "set run.envs = 1 and start one trainer, or set curriculum.stages = []".into(),
-        );
-    }
-    if !stages.is_empty() && config.trainer.module != OWN_TRAINER {
-        return refuse(
-            format!(
-                "`trainer.module` = \"{}\" does not decide lessons, and a curriculum waits for these decisions",
-                config.trainer.module
-            ),
-            format!("set trainer.module = \"{OWN_TRAINER}\" or curriculum.stages = []"),
-        );
-    }
-    for (number, stage) in (1..).zip(stages) {
-        let road_users = stage.cavs + traffic.others + traffic.pedestrians;
-        if road_users > traffic.max_road_users {
-            return refuse(
-                format!(
-                    "stage {number} of `curriculum.stages` asks for {road_users} road users, `traffic.max_road_users` is {}",
-                    traffic.max_road_users
-                ),
-                format!("set traffic.max_road_users to {road_users} or more"),
-            );
-        }
     }
     maps(settings, config)?;
     if let Some((number, unknown)) = config.curriculum.unknown_map() {
@@ -67,9 +34,104 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         );
     }
     (1..).zip(stages).try_for_each(|(number, stage)| {
+        road_users(settings, config, number, stage)?;
+        counted_lessons(settings, config, number, stage)?;
         gate_of_stage(settings, config, number, stage)?;
         choice_of_map(settings, number, stage)
     })
+}
+
+/// A stage has road users that the task needs, and no more than there is room for.
+fn road_users(
+    settings: &LayeredSettings,
+    config: &Config,
+    number: usize,
+    stage: &StageConfig,
+) -> Result<(), ConfigError> {
+    let traffic = stage.traffic(&config.traffic);
+    let refuse = |key: &str, message: String, help: String| {
+        let entry = ("curriculum.stages", number - 1, key);
+        let message = format!("stage {number} of `curriculum.stages` {message}");
+        Err(conflict_in_entry(settings, entry, message, help))
+    };
+    let road_users = traffic.cavs + traffic.others + traffic.pedestrians + traffic.heroes;
+    if road_users > traffic.max_road_users {
+        return refuse(
+            "curriculum.stages.cavs",
+            format!(
+                "asks for {road_users} road users, `traffic.max_road_users` is {}",
+                traffic.max_road_users
+            ),
+            format!("set traffic.max_road_users to {road_users} or more"),
+        );
+    }
+    if config.drives() {
+        return match traffic.heroes {
+            0 => refuse(
+                "curriculum.stages.heroes",
+                "has no hero to teach".into(),
+                "give the stage `heroes`, or set traffic.heroes".into(),
+            ),
+            _ if traffic.hero_turns != HeroTurns::Any && !traffic.hero_route.is_empty() => refuse(
+                "curriculum.stages.hero_turns",
+                "sets `hero_turns`, which is for routes that are drawn, and `traffic.hero_route` gives one".into(),
+                "set traffic.hero_route = [], or leave `hero_turns` out".into(),
+            ),
+            _ => Ok(()),
+        };
+    }
+    if stage.heroes.is_some() || stage.hero_turns.is_some() {
+        return refuse(
+            "curriculum.stages.heroes",
+            "sets heroes, which need the driving task".into(),
+            "set task.kind = \"driving\", or leave `heroes` and `hero_turns` out".into(),
+        );
+    }
+    if traffic.cavs == 0 {
+        return refuse(
+            "curriculum.stages.cavs",
+            format!("has no connected vehicle for the {} task", config.task.kind.name()),
+            "set `cavs` to 1 or more".into(),
+        );
+    }
+    Ok(())
+}
+
+/// Where no single trainer of a single environment decides, stages end by the number of their lessons.
+fn counted_lessons(
+    settings: &LayeredSettings,
+    config: &Config,
+    number: usize,
+    stage: &StageConfig,
+) -> Result<(), ConfigError> {
+    if config.trainer_decides_lessons() {
+        return Ok(());
+    }
+    let why = match (config.run.envs, config.trainer.ranks) {
+        (2.., _) => format!("the {} environments of `run.envs`", config.run.envs),
+        (_, 2..) => format!("the environments of {} ranks", config.trainer.ranks),
+        _ => format!("a run with `trainer.module` = \"{}\"", config.trainer.module),
+    };
+    let key = match (stage.until_std, stage.until_metric, stage.restart) {
+        (Some(_), _, _) => "until_std",
+        (None, Some(_), _) => "until_metric",
+        (None, None, false) => "restart",
+        (None, None, true) => return Ok(()),
+    };
+    Err(conflict_in_entry(
+        settings,
+        ("curriculum.stages", number - 1, &format!("curriculum.stages.{key}")),
+        format!(
+            "stage {number} of `curriculum.stages`: `{key}` needs one trainer that decides, and {why} count lessons"
+        ),
+        format!(
+            "{}, or train in one environment with one trainer, \"{OWN_TRAINER}\"",
+            match key {
+                "restart" => "leave `restart` out",
+                _ => "use `until_lessons`",
+            }
+        ),
+    ))
 }
 
 /// A gate has a metric of the run's task and the value that it must reach, or neither.

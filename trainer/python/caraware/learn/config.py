@@ -97,6 +97,8 @@ class TrainerConfig:
     """How far a value may move from the value before the update; None: any way."""
     target_kl: float | None
     """The policy's update ends with the epoch whose mean KL divergence is larger; None: after all epochs."""
+    value_updates: int
+    """Updates at the beginning in which the policy keeps its parameters, and the value network alone learns."""
     max_grad_norm: float
     """Largest gradient norm, of the policy and of the value network each."""
     actions_per_observation: int

@@ -384,6 +384,31 @@ class ForwardPass:
     """f32 `[N]`: of the tick after the last one in each slot; None where no discount asks for it."""
 
 
+@dataclass(frozen=True)
+class StoredPolicy:
+    """The policy's parameters and moments before an update that only the value network keeps."""
+
+    parameters: dict[str, Tensor]
+    moments: dict[str, Tensor]
+
+    def put_back(self, updater: PolicyUpdate) -> None:
+        """Undo the policy's part of the update."""
+        own = updater.parameters()
+        with torch.no_grad():
+            for name, tensor in self.parameters.items():
+                own[name].copy_(tensor)
+        updater.restore_moments(updater.moments() | self.moments)
+
+
+def _policy_of(updater: PolicyUpdate) -> StoredPolicy:
+    """Copies of what an update changes in the policy."""
+
+    def copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: tensor.clone() for name, tensor in tensors.items() if name.startswith("policy.")}
+
+    return StoredPolicy(copied(updater.parameters()), copied(updater.moments()))
+
+
 class Ppo:
     """Policy, value network, their optimisers and random numbers; everything that a checkpoint must hold."""
 
@@ -508,7 +533,10 @@ class Ppo:
     def update(self, batch: Batch) -> UpdateStats:
         """Learn from a scored batch. Raises `NonFiniteLoss`."""
         now = ScheduledValues.at(self.config, self.updates, self.progress)
+        before = _policy_of(self.updater) if self.updates < self.config.value_updates else None
         figures = self.updater.improve(batch, self.shuffling, now)
+        if before is not None:
+            before.put_back(self.updater)
         self.updates += 1
         return self._stats(batch, figures, now)
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from caraware import _native
-from caraware.ipc.run_file import RunFile, config_table
+from caraware.ipc.run_file import RunFile, config_table, setting
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,12 @@ class Stage:
 
     @classmethod
     def from_run(cls, run: RunFile) -> "tuple[Stage, ...]":
-        """The stages of a run file's configuration; none without a curriculum."""
-        stages = config_table(run, "curriculum")["stages"]
+        """The stages that the trainer decides on; none without a curriculum.
+
+        None either where several learn, or one in several environments: each environment counts its own lessons then.
+        """
+        alone = setting(run, "run.envs", int) == 1 and setting(run, "trainer.ranks", int) <= 1
+        stages = config_table(run, "curriculum")["stages"] if alone else ()
         return tuple(cls(**{name: stage.get(name) for name in cls.__dataclass_fields__}) for stage in stages)
 
     def passed(self, policy_std: float, metrics: Mapping[str, float], lessons: int) -> bool:

@@ -1,5 +1,6 @@
 """The learner of a training run: PPO, the baseline beside it, and how far both have come."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,8 @@ from caraware.run.manifest import CheckpointError, Counters
 from caraware.run.stream_position import StreamPosition
 from caraware.tasks.lane import LanePosition
 from caraware.tasks.localisation import Localisation
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -55,7 +58,13 @@ class Learner:
         if config.resume_from is not None:
             learner.load(config.resume_from)
         elif config.begin_from is not None:
-            begin_from(ppo.updater.parameters(), config.begin_from)
+            lacks_values = not begin_from(ppo.updater.parameters(), config.begin_from)
+            if lacks_values and trainer.value_updates == 0:
+                log.warning(
+                    "%s has no value network, and a policy that follows an untrained one unlearns: "
+                    "set trainer.value_updates = 8, so that eight updates teach the values alone",
+                    config.begin_from,
+                )
         return learner
 
     def warm_up(self) -> None:
@@ -118,10 +127,10 @@ class Learner:
             self.supervised.restore(stored[SUPERVISED])
 
 
-def begin_from(own: dict[str, Tensor], place: Path) -> None:
+def begin_from(own: dict[str, Tensor], place: Path) -> bool:
     """Fill the parameters of a new policy from a checkpoint or a file. Raises `CheckpointError`.
 
-    Parameters that the file lacks stay as drawn: a clone of a driver has no values.
+    Parameters that the file lacks stay as drawn: a clone of a driver has no values. False if it has none.
     """
     file = place / PARAMETERS if place.is_dir() else place
     try:
@@ -133,3 +142,4 @@ def begin_from(own: dict[str, Tensor], place: Path) -> None:
         raise CheckpointError(file, "does not hold parameters of this run's networks")
     for name, tensor in known.items():
         own[name].copy_(tensor)
+    return any(name.startswith("value.") for name in known)

@@ -194,7 +194,7 @@ class TrainingLoop:
             processed += 1
             if processed % CREDIT_TICKS == 0:
                 environment.channel.consumed(obs.tick)
-            if obs.lesson_last:
+            if self._curriculum and obs.lesson_last:
                 self._lesson_end = obs
                 break
             # A successor can continue amid an evaluation, or after an update.
