@@ -186,7 +186,12 @@ fn drivers(options: &BenchOptions) -> Vec<TripDriver> {
     let mut drivers = vec![
         driver("random actions", "random", &[]),
         driver("script (pure pursuit)", "scripted", &[]),
-        driver("SUMO's own driver", "sumo", &["task.driver=sumo"]),
+        // With the view of the road ahead that mirrors have of SUMO's paths elsewhere.
+        driver(
+            "SUMO's own driver",
+            "sumo",
+            &["task.driver=sumo", "vehicle.preview_s=1.5"],
+        ),
     ];
     if let Some(policy) = &options.policy {
         let place = format!("task.begin_from={}", policy.display());

@@ -264,7 +264,7 @@ impl CoreProcess {
     fn publish(&mut self, frame: &MessageHeader, tick: u32, states: &[TrafficState]) -> Result<(), Failure> {
         let count = self.mirror.count(tick);
         let heroes = match &self.actions {
-            Some(_) => states.iter().filter(|state| state.kind == Kind::Hero as u32).count(),
+            Some(_) => self.mirror.hero_count(tick),
             None => 0,
         };
         let (ours, settings) = (self.membership.header(), self.mirror.settings());

@@ -367,6 +367,10 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
                 "set traffic.hero_ids to the ids of the vehicles to drive, and traffic.heroes = 0",
             ))
         }
+        (Mode::Train | Mode::Play, TrafficInput::Scenario(..)) if config.vehicle.preview_s > 0.0 => Err(Exit::config(
+            "with `vehicle.preview_s` a hero of a .sumocfg would vanish before the end of its route, where SUMO ends it earlier",
+            "set vehicle.preview_s = 0 with heroes of a .sumocfg",
+        )),
         (Mode::Train | Mode::Play, _) => Ok(()),
     }
 }

@@ -389,6 +389,15 @@ impl Mirror {
         }
     }
 
+    /// Number of heroes in tick `tick`.
+    #[must_use]
+    pub fn hero_count(&self, tick: u32) -> usize {
+        let last = self.is_last(tick);
+        let present = self.present.iter().map(|(_, place)| &self.slab[*place as usize]);
+        let heroes = present.filter(|road_user| road_user.is_hero());
+        heroes.filter(|hero| last || hero.is_in_whole_step()).count()
+    }
+
     /// Number of trailing bodies in tick `tick`: of the vehicles with the lowest indices, as many as a message has room for.
     #[must_use]
     pub fn trailing_count(&self, tick: u32) -> usize {

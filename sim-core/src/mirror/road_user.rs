@@ -296,6 +296,12 @@ impl RoadUser {
         self.hidden > 0
     }
 
+    /// True for a hero.
+    #[must_use]
+    pub fn is_hero(&self) -> bool {
+        self.now.kind == Kind::Hero as u32
+    }
+
     /// True if the road user has a state in all ticks of the current SUMO step, not only in the last.
     #[must_use]
     pub fn is_in_whole_step(&self) -> bool {

@@ -208,11 +208,11 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "set traffic.hero_route = [], or traffic.hero_turns = \"any\"",
         ));
     }
-    if config.vehicle.preview_s > 0.0 {
+    if config.vehicle.preview_s > 0.0 && config.task.driver == HeroDriver::Actions {
         return Some((
             "vehicle.preview_s",
             "`vehicle.preview_s` puts the traffic around a hero into the past".into(),
-            "set vehicle.preview_s = 0 with task.kind = \"driving\"",
+            "set vehicle.preview_s = 0 with task.kind = \"driving\", or task.driver = \"sumo\"",
         ));
     }
     if config.task.driver == HeroDriver::Sumo && config.vehicle.hero_model == VehicleModel::RigidBody {

@@ -442,6 +442,19 @@ fn a_stage_of_the_driving_task_sets_what_heroes_learn_to_drive_through() {
     assert!(message.contains("`traffic.hero_route` gives one"), "{message}");
 }
 
+/// The mirror of a hero that SUMO drives may be behind SUMO as any other. One that takes actions is where its own model is.
+#[test]
+fn a_view_of_the_road_ahead_is_for_heroes_that_sumo_drives() {
+    let watched = "task.kind = \"driving\"\ntraffic.heroes = 1\nvehicle.preview_s = 1.5\ntrainer.module = \"caraware.driving.trips\"\n";
+    assert!(config_of(&format!("{watched}task.driver = \"sumo\"\n")).is_ok());
+    let (message, help) = error_of(watched);
+    assert!(
+        message.contains("puts the traffic around a hero into the past"),
+        "{message}"
+    );
+    assert!(help.contains("task.driver = \"sumo\""), "{help}");
+}
+
 /// Nobody could decide for several environments or trainers at once.
 #[test]
 fn several_environments_count_the_lessons_of_a_stage() {

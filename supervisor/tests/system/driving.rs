@@ -453,3 +453,67 @@ fn a_task_that_cannot_be_driven_is_refused_before_anything_starts() {
     );
     workplace.assert_nothing_left();
 }
+
+/// Its mirrors are 1.5 s behind SUMO, and the trips end where the mirrors are.
+#[test]
+fn heroes_that_sumo_drives_arrive_with_a_view_of_the_road_ahead() {
+    let workplace = Workplace::new();
+    let settings = [
+        "task.driver=sumo",
+        "vehicle.preview_s=1.5",
+        "trainer.module=caraware.driving.trips",
+        "curriculum.maps=[\"avenue\"]",
+        "traffic.heroes=10",
+        "traffic.others=10",
+        "episode.ticks=1",
+        "episode.training_episodes=1",
+        "episode.evaluation_ticks=700",
+        "episode.final_evaluations=1",
+        "fanout.enabled=false",
+    ];
+    let settings = settings.iter().flat_map(|setting| ["--set", setting]);
+    let arguments: Vec<&str> = ["train", "driving", "--name", "watched"]
+        .into_iter()
+        .chain(settings)
+        .collect();
+    let mut command = workplace.command(&arguments);
+    command.env("CARAWARE_DRIVER", "sumo");
+    succeed(command);
+    let report = workplace.report("watched");
+    let heroes = &report["dynamics"]["heroes"];
+    let [arrived, off_road] = ["arrived", "off_road"].map(|name| heroes[name].as_u64().unwrap());
+    assert!(arrived >= 3 && off_road == 0, "{heroes}");
+    let trips = report["trainer"]["trips"].as_array().unwrap();
+    assert!(trips.iter().any(|trip| trip["end"] == "arrival"), "{trips:#?}");
+
+    let scenario = [
+        "map.origin_latitude_deg=52",
+        "map.origin_longitude_deg=10",
+        "vehicle.preview_s=1.5",
+    ];
+    let scenario = scenario.iter().flat_map(|setting| ["--set", setting]);
+    let city = ["generate", "city", "--vehicles", "10", "--junctions", "3"];
+    workplace.succeed(&city);
+    let heroes = [
+        "train",
+        "city/city.sumocfg",
+        "--set",
+        "task.kind=driving",
+        "--set",
+        "task.driver=sumo",
+    ];
+    let more = [
+        "--set",
+        "traffic.hero_ids=[\"a\"]",
+        "--set",
+        "trainer.module=caraware.driving.trips",
+    ];
+    let refused = workplace.run(&heroes.into_iter().chain(more).chain(scenario).collect::<Vec<_>>());
+    assert_eq!(refused.status.code(), Some(2), "{}", text(&refused));
+    assert!(
+        text(&refused).contains("would vanish before the end"),
+        "{}",
+        text(&refused)
+    );
+    workplace.assert_nothing_left();
+}

@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     activity::Awaited,
-    config::{TrafficConfig, TrafficEngine},
+    config::{HeroDriver, TrafficConfig, TrafficEngine},
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
@@ -156,7 +156,11 @@ fn population(
         Source::Population { .. } => {
             sumo.scale_speed_limits(traffic.speed_limit_factor)?;
             let trips = TripSelection::of_episode(traffic.held_out_trips, episode.evaluation);
-            let (size, heroes) = (PopulationSize::from(traffic), HeroRoutes::from(traffic));
+            let size = PopulationSize::from(traffic);
+            let heroes = HeroRoutes {
+                go_on: run.config.task.driver == HeroDriver::Sumo && run.mirror_delay_frames() > 0,
+                ..HeroRoutes::from(traffic)
+            };
             Population::start_on(sumo, size, heroes, trips, episode.seed).map(Some)
         }
         Source::Scenario { .. } => Ok(None),

@@ -99,6 +99,8 @@ pub(crate) struct Driver {
     pub(crate) placed: CommandedRoads,
     added_step: u64,
     departed: bool,
+    /// SUMO drives it beyond the end of its route.
+    goes_on: bool,
 }
 
 /// Where heroes drive.
@@ -108,6 +110,8 @@ pub struct HeroRoutes<'a> {
     pub edges: &'a [String],
     /// Which routes are drawn.
     pub turns: HeroTurns,
+    /// SUMO drives them beyond the ends of their routes: their mirrors, which are behind SUMO, arrive there later.
+    pub go_on: bool,
 }
 
 impl<'a> From<&'a TrafficConfig> for HeroRoutes<'a> {
@@ -115,6 +119,7 @@ impl<'a> From<&'a TrafficConfig> for HeroRoutes<'a> {
         Self {
             edges: &traffic.hero_route,
             turns: traffic.hero_turns,
+            go_on: false,
         }
     }
 }
@@ -194,6 +199,9 @@ impl Population {
         };
         if event.event == MetaEvent::Departed as u32 {
             self.drivers[place].departed = true;
+            if self.drivers[place].goes_on {
+                self.drivers[place].add_to_route(sumo);
+            }
         } else if event.event == MetaEvent::Arrived as u32 {
             self.fill(sumo, place, step)?;
         }
@@ -234,6 +242,7 @@ impl Driver {
     fn add(&mut self, sumo: &mut Sumo, step: u64) -> Result<(), SumoError> {
         if let DriverTrips::Given(route) = &self.way {
             (self.route_edges, self.added_step, self.departed) = (route.len(), step, false);
+            self.goal = route.last().and_then(|edge| self.roads.find(edge)).unwrap_or(self.goal);
             let added = sumo
                 .simulation_mut()
                 .add_vehicle_at_start(&self.id, &self.vehicle_type, route);
@@ -279,9 +288,13 @@ impl Driver {
             .simulation()
             .route_index(&self.id)
             .map_or(0, |index| usize::try_from(index).unwrap_or(0));
-        if self.route_edges > passed + EDGES_AHEAD {
-            return;
+        if self.route_edges <= passed + EDGES_AHEAD {
+            self.add_to_route(sumo);
         }
+    }
+
+    /// Adds the way to another random edge.
+    fn add_to_route(&mut self, sumo: &mut Sumo) {
         let goal = self.draw_goal(self.goal);
         let more = self.roads.route(self.goal, goal);
         match sumo.simulation_mut().extend_route(&self.id, &more) {
@@ -344,6 +357,7 @@ fn drivers(
             placed: CommandedRoads::default(),
             added_step: 0,
             departed: false,
+            goes_on: prefix == HERO_PREFIX && heroes.go_on,
         });
     }
     Ok(drivers)

@@ -27,7 +27,10 @@ fn options(bench: &Bench) -> SumoOptions {
 
 /// Routes of all heroes that depart within six seconds.
 fn routes(sumo: &mut Sumo, turns: HeroTurns) -> BTreeMap<u32, Vec<RoutePoint>> {
-    let heroes = HeroRoutes { edges: &[], turns };
+    let heroes = HeroRoutes {
+        turns,
+        ..HeroRoutes::default()
+    };
     let mut population = Population::start(sumo, SIZE, heroes, 5).unwrap();
     let mut routes: BTreeMap<u32, Vec<RoutePoint>> = BTreeMap::new();
     run(sumo, 60, |sumo, frame| {
