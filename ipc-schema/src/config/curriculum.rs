@@ -208,12 +208,6 @@ pub struct StageConfig {
 }
 
 impl StageConfig {
-    /// True if it can end by what a learner has learnt, and not by the number of lessons alone.
-    #[must_use]
-    pub fn depends_on_learning(&self) -> bool {
-        self.until_std.is_some() || self.until_metric.is_some()
-    }
-
     /// The traffic of this stage, in a run with `traffic`.
     #[must_use]
     pub fn traffic(&self, traffic: &TrafficConfig) -> TrafficConfig {
@@ -243,8 +237,8 @@ fn one() -> f64 {
 }
 
 impl Config {
-    /// True if the trainer decides which stage of the curriculum a lesson belongs to. Where several learn, or one in several
-    /// environments, each environment counts its own lessons; so it does for a trainer that knows nothing of lessons.
+    /// True if the trainer decides which stage of the curriculum a lesson belongs to. With several trainers or environments, or a trainer
+    /// other than [`OWN_TRAINER`], each environment counts its own lessons.
     #[must_use]
     pub fn trainer_decides_lessons(&self) -> bool {
         let is_alone = self.run.envs == 1 && self.trainer.ranks <= 1;

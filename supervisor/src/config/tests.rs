@@ -455,20 +455,20 @@ fn a_view_of_the_road_ahead_is_for_heroes_that_sumo_drives() {
     assert!(help.contains("task.driver = \"sumo\""), "{help}");
 }
 
-/// Nobody could decide for several environments or trainers at once.
+/// A decision of one trainer is not that of the others, and lessons end at other ticks in each environment.
 #[test]
 fn several_environments_count_the_lessons_of_a_stage() {
     let envs = "run.envs = 2\n";
     let config = config_of(&format!("{envs}[[curriculum.stages]]\ncavs = 1\nuntil_lessons = 3\n")).unwrap();
     assert!(!config.trainer_decides_lessons());
-    for (who, key, value) in [
+    for (setting, key, value) in [
         (envs, "until_std", "0.5"),
         (envs, "until_metric", "\"error_m\"\nuntil_value = 6.0"),
         (envs, "restart", "false"),
         ("trainer.ranks = 2\n", "until_std", "0.5"),
         ("trainer.module = \"mine\"\n", "until_std", "0.5"),
     ] {
-        let (message, help) = error_of(&format!("{who}[[curriculum.stages]]\ncavs = 1\n{key} = {value}\n"));
+        let (message, help) = error_of(&format!("{setting}[[curriculum.stages]]\ncavs = 1\n{key} = {value}\n"));
         let expected = format!("my.toml:4: stage 1 of `curriculum.stages`: `{key}` needs one trainer that decides");
         assert!(message.starts_with(&expected), "{message}");
         assert!(help.contains("\"caraware.train\""), "{help}");

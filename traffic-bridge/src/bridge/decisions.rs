@@ -1,5 +1,5 @@
 //! Which stage of the curriculum a lesson belongs to. The trainer decides; without a trainer the log of an earlier run does, or
-//! the number of lessons, which also decides where several learn or one does in several environments.
+//! the number of lessons. That number also decides with several trainers or environments.
 
 use std::{
     fs::File,
