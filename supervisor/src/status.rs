@@ -27,7 +27,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(60);
 /// Prints the process table of every live run, or the same as JSON.
 ///
 /// # Errors
-/// The run named is not alive, or its shared memory cannot be opened.
+/// The run named is not alive.
 pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
     let runs: Vec<RunFile> = match name {
         Some(name) => vec![registry::find(Some(name))?],
@@ -38,7 +38,7 @@ pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
             .collect(),
     };
     if json {
-        // A run may end while the others are measured.
+        // A run may begin or end at this moment.
         let measured: Vec<RunMeasurement> = runs.iter().filter_map(|run| RunMeasurement::take(run).ok()).collect();
         let text = serde_json::to_string(&measured)
             .map_err(|error| Exit::run(format!("the table has no form in JSON: {error}"), ""))?;
@@ -63,9 +63,26 @@ pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
         "MEMORY"
     );
     for run in &runs {
-        RunMeasurement::take(run)?.print();
+        match RunMeasurement::take(run) {
+            Ok(measured) => measured.print(),
+            Err(reason) => print_unreadable(run, &reason),
+        }
     }
     Ok(())
+}
+
+/// Prints the row of a live run whose shared memory is not there: the run has just begun, or is about to end.
+fn print_unreadable(run: &RunFile, reason: &Exit) {
+    if registry::is_alive(&run.run_dir) {
+        crate::say!(
+            "{:<16} {:<16} {:<9} {:>8} its processes cannot be seen: {}",
+            run.name,
+            "supervisor",
+            "running",
+            run.supervisor_pid,
+            reason.summary().0
+        );
+    }
 }
 
 /// The processes of a run and their rates, as `caraware ps` shows them.

@@ -38,6 +38,8 @@ SETTINGS = {
 LARGEST_DIFFERENCE = 1e-5
 """Of a tensor, relative (L2): a few updates from scratch, float32 sums in another order. Seen: 6e-7."""
 PATIENCE_S = 240
+SLOW = "run.real_time_factor=0.7"
+"""For runs that go on while three pairs of trainers start, which takes a busy machine 10 s a pair. It lasts 50 s."""
 
 
 @contextmanager
@@ -535,7 +537,7 @@ def test_a_handover_now_replaces_the_trainers_of_all_ranks_wherever_they_are(
 ) -> None:
     names = ("now", "now-rank1")
     # With a checkpoint after every second update, ticks that were learnt from are sent again.
-    now = two_ranks(tmp_path, registry, "now", "trainer.checkpoint_interval=2", "run.real_time_factor=2")
+    now = two_ranks(tmp_path, registry, "now", "trainer.checkpoint_interval=2", SLOW)
     runs = [tmp_path / name for name in names]
     wait_until(lambda: all(map(has_begun, runs)), now)
     replaced = []
@@ -569,7 +571,7 @@ def test_a_successor_that_dies_after_the_old_trainers_have_left_does_not_end_the
 ) -> None:
     find_modules(tmp_path, monkeypatch, killed_once=KILLED_ONCE, gives_up=GIVES_UP)
     names = ("handed", "handed-rank1")
-    handed = two_ranks(tmp_path, registry, "handed", *EVERY_UPDATE, "run.real_time_factor=2")
+    handed = two_ranks(tmp_path, registry, "handed", *EVERY_UPDATE, SLOW)
     wait_until(lambda: (tmp_path / "handed-rank1" / "checkpoints" / "update-000001").exists(), handed)
     # One that is killed comes back.
     code, said = answer(ask(tmp_path, registry, "handover", "handed", "--set=trainer.module=killed_once"))

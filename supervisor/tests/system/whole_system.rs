@@ -265,6 +265,27 @@ fn the_processes_are_separate_and_stop_ends_them_in_order() {
     workplace.assert_nothing_left();
 }
 
+/// A run is in the registry before its shared memory is there, and a little longer.
+#[test]
+fn ps_succeeds_while_a_run_starts_and_while_it_ends() {
+    let workplace = Workplace::new();
+    let mut run = Background::start(&workplace, &small("simulate", "short", &QUIET));
+    let mut tables = Vec::new();
+    while run.0.try_wait().unwrap().is_none() {
+        let mut table = workplace.command(&["ps"]);
+        tables.push(table.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap());
+        std::thread::park_timeout(Duration::from_millis(20));
+    }
+    assert!(run.0.wait().unwrap().success());
+    assert!(tables.len() > 5, "{}", tables.len());
+    for table in tables {
+        let output = table.wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", text(&output));
+        assert!(output.stderr.is_empty(), "{}", text(&output));
+    }
+    workplace.assert_nothing_left();
+}
+
 #[test]
 fn after_sigkill_of_the_supervisor_everything_ends_and_the_next_run_starts() {
     let workplace = Workplace::new();
