@@ -6,6 +6,7 @@ version of SUMO write the same net. None of the project's own maps is among them
 taught on them.
 """
 
+import argparse
 import math
 import random
 import subprocess
@@ -200,13 +201,21 @@ def build(seed: int, directory: Path) -> Path:
     return out
 
 
+def parser() -> argparse.ArgumentParser:
+    """The arguments."""
+    known = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    known.add_argument("directory", type=Path, help="where the nets are written; created if it does not exist")
+    known.add_argument("first", type=int, nargs="?", default=1, help="first seed (default: %(default)s)")
+    known.add_argument("last", type=int, nargs="?", default=12, help="last seed (default: %(default)s)")
+    return known
+
+
 def main(arguments: Sequence[str]) -> None:
     """Write the nets."""
-    directory = Path(arguments[0])
-    directory.mkdir(parents=True, exist_ok=True)
-    first, last = (int(arguments[place]) if len(arguments) > place else default for place, default in ((1, 1), (2, 12)))
-    for seed in range(first, last + 1):
-        sys.stdout.write(f"{build(seed, directory)}\n")
+    given = parser().parse_args(arguments)
+    given.directory.mkdir(parents=True, exist_ok=True)
+    for seed in range(given.first, given.last + 1):
+        sys.stdout.write(f"{build(seed, given.directory)}\n")
 
 
 if __name__ == "__main__":

@@ -34,6 +34,14 @@ def test_the_same_seed_writes_the_same_net(tmp_path: Path) -> None:
     assert sorted(path.name for path in first.parent.iterdir()) == [first.name], "sources are left behind"
 
 
+def test_it_explains_itself_and_writes_nothing(tmp_path: Path) -> None:
+    said = subprocess.run(
+        [sys.executable, str(SCRIPT), "--help"], check=True, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert "last seed (default: 12)" in said.stdout
+    assert not list(tmp_path.iterdir())
+
+
 def test_together_they_have_every_kind_of_junction_slopes_and_bends(nets: list[ET.Element]) -> None:
     kinds: Counter[str] = Counter()
     for net in nets:

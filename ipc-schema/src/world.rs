@@ -211,7 +211,7 @@ pub const AROUND: usize = SENSED_USERS * USER_COLUMNS
 pub struct HeroView {
     /// Points of its route [`ROUTE_AHEAD_M`] ahead, forward and left of the rear axle, body frame, metres.
     pub route_m: [[f32; 2]; 4],
-    /// Speed limit at its position, m/s.
+    /// Highest speed at its position from which braking with 2 m/s² keeps the limits there and ahead, m/s.
     pub speed_limit_mps: f32,
     /// Offset from the rear axle to the nearest point of its route, positive to the left, metres.
     pub route_offset_m: f32,

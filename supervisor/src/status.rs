@@ -40,6 +40,9 @@ pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
     if json {
         // A run may begin or end at this moment.
         let measured: Vec<RunMeasurement> = runs.iter().filter_map(|run| RunMeasurement::take(run).ok()).collect();
+        if let (Some(name), true) = (name, measured.is_empty()) {
+            registry::find(Some(name))?;
+        }
         let text = serde_json::to_string(&measured)
             .map_err(|error| Exit::run(format!("the table has no form in JSON: {error}"), ""))?;
         crate::say!("{text}");
@@ -65,7 +68,12 @@ pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
     for run in &runs {
         match RunMeasurement::take(run) {
             Ok(measured) => measured.print(),
-            Err(reason) => print_unreadable(run, &reason),
+            Err(reason) => {
+                if let Some(name) = name {
+                    registry::find(Some(name))?;
+                }
+                print_unreadable(run, &reason);
+            }
         }
     }
     Ok(())

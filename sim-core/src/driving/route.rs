@@ -4,6 +4,9 @@ use std::ops::Range;
 
 use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RIGHT_OF_WAY, RoutePoint};
 
+/// Deceleration with which a driver is to approach a lower limit, as in a turn, m/s².
+const BRAKING_MPS2: f64 = 2.0;
+
 /// A traffic light on the route.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StopLine {
@@ -46,7 +49,10 @@ pub struct HeroRoute {
     directions: Vec<[f64; 2]>,
     /// Around each segment.
     boxes_m: Vec<Box2>,
+    /// Of the segment that each point begins.
     speed_limits_mps: Vec<f32>,
+    /// Highest speed at each point from which [`BRAKING_MPS2`] leads to all limits ahead.
+    approach_speeds_mps: Vec<f64>,
     stop_lines: Vec<StopLine>,
     crossings: Vec<Crossing>,
     /// The newest point lies on a way across a junction.
@@ -71,6 +77,8 @@ impl HeroRoute {
         self.points_m.push(here);
         self.stations_m.push(station_m);
         self.speed_limits_mps.push(point.speed_limit_mps);
+        self.approach_speeds_mps.push(f64::from(point.speed_limit_mps));
+        self.approach_newest_limit();
         if point.edge == 0 {
             self.first_edge_m = station_m;
         }
@@ -92,6 +100,18 @@ impl HeroRoute {
                 signal: point.signal,
                 link: point.link,
             });
+        }
+    }
+
+    /// Lowers the speeds before the newest point, as far as its limit asks for.
+    fn approach_newest_limit(&mut self) {
+        for ahead in (1..self.approach_speeds_mps.len()).rev() {
+            let length_m = self.stations_m[ahead] - self.stations_m[ahead - 1];
+            let approach_mps = approach_mps(self.approach_speeds_mps[ahead], length_m);
+            if self.approach_speeds_mps[ahead - 1] <= approach_mps {
+                return;
+            }
+            self.approach_speeds_mps[ahead - 1] = approach_mps;
         }
     }
 
@@ -125,14 +145,15 @@ impl HeroRoute {
         &self.crossings
     }
 
-    /// Speed limit at a station, m/s; 0 without points.
+    /// Highest speed at a station from which a braking of [`BRAKING_MPS2`] keeps this and all limits ahead, m/s; 0 without points.
     #[must_use]
     pub fn speed_limit_mps(&self, station_m: f64) -> f32 {
-        let place = self.stations_m.partition_point(|start| *start <= station_m);
-        self.speed_limits_mps
-            .get(place.saturating_sub(1))
-            .copied()
-            .unwrap_or(0.0)
+        let ahead = self.stations_m.partition_point(|start| *start <= station_m).max(1);
+        let limit_mps = self.speed_limits_mps.get(ahead - 1).copied().unwrap_or(0.0);
+        match (self.approach_speeds_mps.get(ahead), self.stations_m.get(ahead)) {
+            (Some(then_mps), Some(end_m)) => limit_mps.min(approach_mps(*then_mps, end_m - station_m) as f32),
+            _ => limit_mps,
+        }
     }
 
     /// The point at a station, straight on beyond the ends; `None` with fewer than two points.
@@ -304,6 +325,11 @@ impl<'a> RouteWindow<'a> {
     }
 }
 
+/// Speed from which [`BRAKING_MPS2`] leads to `then_mps` within a distance.
+fn approach_mps(then_mps: f64, distance_m: f64) -> f64 {
+    (then_mps * then_mps + 2.0 * BRAKING_MPS2 * distance_m).sqrt()
+}
+
 fn distance_m([ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     libm::hypot(bx - ax, by - ay)
 }
@@ -365,7 +391,52 @@ mod tests {
         assert_eq!(route.project([101.0, 40.0], 0.0, 99.0).unwrap().station_m, 100.0);
     }
 
+    /// Limits of 14, 5 and 14 m/s from 0, 100 and 120 m on.
+    #[test]
+    fn a_lower_limit_is_approached_with_a_constant_deceleration() {
+        let mut route = HeroRoute::default();
+        for (x_m, speed_limit_mps) in [(0.0, 14.0), (60.0, 14.0), (100.0, 5.0), (120.0, 14.0), (200.0, 14.0)] {
+            route.push(&RoutePoint {
+                x_m,
+                speed_limit_mps,
+                ..RoutePoint::default()
+            });
+        }
+        // 5² + 2 · 2 · d = 14² at d = 42.75 m.
+        let at = |station_m| route.speed_limit_mps(station_m);
+        assert_eq!((at(0.0), at(57.25)), (14.0, 14.0));
+        assert_eq!((at(64.0), at(86.0)), (13.0, 9.0));
+        assert_eq!((at(100.0), at(119.9), at(120.0), at(199.0)), (5.0, 5.0, 14.0, 14.0));
+        // Before the beginning and behind the end of the route.
+        assert_eq!((at(-1.0), at(300.0)), (14.0, 14.0));
+    }
+
     proptest! {
+        /// The speed at a station is the lowest of the limit there and of those from which braking leads to each limit ahead.
+        #[test]
+        fn no_limit_ahead_is_exceeded_and_no_speed_is_given_away(
+            pieces in prop::collection::vec((0.5..40.0_f64, 1.0..30.0_f32), 2..12), share in 0.0..1.0_f64,
+        ) {
+            let mut route = HeroRoute::default();
+            let mut x_m = 0.0;
+            for (length_m, speed_limit_mps) in &pieces {
+                route.push(&RoutePoint { x_m, speed_limit_mps: *speed_limit_mps, ..RoutePoint::default() });
+                x_m += length_m;
+            }
+            let station_m = share * route.length_m();
+            let begins_m = pieces.iter().scan(0.0, |sum_m, (length_m, _)| Some(std::mem::replace(sum_m, *sum_m + length_m)));
+            let mut highest_mps = f64::INFINITY;
+            for (begin_m, (_, limit_mps)) in begins_m.zip(&pieces) {
+                let limit_mps = f64::from(*limit_mps);
+                if begin_m > station_m {
+                    highest_mps = highest_mps.min((limit_mps.powi(2) + 4.0 * (begin_m - station_m)).sqrt());
+                } else {
+                    highest_mps = limit_mps;
+                }
+            }
+            prop_assert!((f64::from(route.speed_limit_mps(station_m)) - highest_mps).abs() < 1e-5);
+        }
+
         /// What a window leaves out changes no answer.
         #[test]
         fn a_window_answers_as_a_search_of_all_its_segments(
