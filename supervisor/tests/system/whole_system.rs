@@ -269,20 +269,30 @@ fn the_processes_are_separate_and_stop_ends_them_in_order() {
 #[test]
 fn ps_succeeds_while_a_run_starts_and_while_it_ends() {
     let workplace = Workplace::new();
-    let mut run = Background::start(&workplace, &small("simulate", "short", &QUIET));
-    let mut tables = Vec::new();
+    let mut run = Background::start(
+        &workplace,
+        &small(
+            "simulate",
+            "short",
+            &[&QUIET[..], &["--set", "run.real_time_factor=8"]].concat(),
+        ),
+    );
+    let mut asked = 0;
     while run.0.try_wait().unwrap().is_none() {
-        let mut table = workplace.command(&["ps"]);
-        tables.push(table.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap());
-        std::thread::park_timeout(Duration::from_millis(20));
+        // Two at a time: they measure for half a second, and one that finds no run, or no shared memory, ends at once.
+        let ask = || {
+            let mut table = workplace.command(&["ps"]);
+            table.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+        };
+        for table in [ask(), ask()] {
+            let output = table.wait_with_output().unwrap();
+            assert!(output.status.success(), "{}", text(&output));
+            assert!(output.stderr.is_empty(), "{}", text(&output));
+            asked += 1;
+        }
     }
     assert!(run.0.wait().unwrap().success());
-    assert!(tables.len() > 5, "{}", tables.len());
-    for table in tables {
-        let output = table.wait_with_output().unwrap();
-        assert!(output.status.success(), "{}", text(&output));
-        assert!(output.stderr.is_empty(), "{}", text(&output));
-    }
+    assert!(asked >= 4, "{asked}");
     workplace.assert_nothing_left();
 }
 
