@@ -253,6 +253,16 @@ fields! {
     User1Length: "user_1_length", "m", LENGTH, Around;
     /// Nearest road user: width, 0 for none.
     User1Width: "user_1_width", "m", WIDTH, Around;
+    /// Nearest road user: distance along the route to where it will be in the hero's way.
+    User1Way: "user_1_way", "m", AHEAD, Around;
+    /// Nearest road user: time until the hero is there at its speed.
+    User1Reaches: "user_1_reaches", "s", GAP, Around;
+    /// Nearest road user: time until its front is in the middle of the hero's way.
+    User1Enters: "user_1_enters", "s", GAP, Around;
+    /// Nearest road user: time until its rear has left the middle of the hero's way.
+    User1Leaves: "user_1_leaves", "s", GAP, Around;
+    /// Nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User1Turn: "user_1_turn", "", SINE, Around;
     /// Second nearest road user: its middle, forward of the rear axle.
     User2X: "user_2_x", "m", NEAR, Around;
     /// Second nearest road user: its middle, to the left of the rear axle.
@@ -269,6 +279,16 @@ fields! {
     User2Length: "user_2_length", "m", LENGTH, Around;
     /// Second nearest road user: width, 0 for none.
     User2Width: "user_2_width", "m", WIDTH, Around;
+    /// Second nearest road user: distance along the route to where it will be in the hero's way.
+    User2Way: "user_2_way", "m", AHEAD, Around;
+    /// Second nearest road user: time until the hero is there at its speed.
+    User2Reaches: "user_2_reaches", "s", GAP, Around;
+    /// Second nearest road user: time until its front is in the middle of the hero's way.
+    User2Enters: "user_2_enters", "s", GAP, Around;
+    /// Second nearest road user: time until its rear has left the middle of the hero's way.
+    User2Leaves: "user_2_leaves", "s", GAP, Around;
+    /// Second nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User2Turn: "user_2_turn", "", SINE, Around;
     /// Third nearest road user: its middle, forward of the rear axle.
     User3X: "user_3_x", "m", NEAR, Around;
     /// Third nearest road user: its middle, to the left of the rear axle.
@@ -285,6 +305,16 @@ fields! {
     User3Length: "user_3_length", "m", LENGTH, Around;
     /// Third nearest road user: width, 0 for none.
     User3Width: "user_3_width", "m", WIDTH, Around;
+    /// Third nearest road user: distance along the route to where it will be in the hero's way.
+    User3Way: "user_3_way", "m", AHEAD, Around;
+    /// Third nearest road user: time until the hero is there at its speed.
+    User3Reaches: "user_3_reaches", "s", GAP, Around;
+    /// Third nearest road user: time until its front is in the middle of the hero's way.
+    User3Enters: "user_3_enters", "s", GAP, Around;
+    /// Third nearest road user: time until its rear has left the middle of the hero's way.
+    User3Leaves: "user_3_leaves", "s", GAP, Around;
+    /// Third nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User3Turn: "user_3_turn", "", SINE, Around;
     /// Fourth nearest road user: its middle, forward of the rear axle.
     User4X: "user_4_x", "m", NEAR, Around;
     /// Fourth nearest road user: its middle, to the left of the rear axle.
@@ -301,6 +331,16 @@ fields! {
     User4Length: "user_4_length", "m", LENGTH, Around;
     /// Fourth nearest road user: width, 0 for none.
     User4Width: "user_4_width", "m", WIDTH, Around;
+    /// Fourth nearest road user: distance along the route to where it will be in the hero's way.
+    User4Way: "user_4_way", "m", AHEAD, Around;
+    /// Fourth nearest road user: time until the hero is there at its speed.
+    User4Reaches: "user_4_reaches", "s", GAP, Around;
+    /// Fourth nearest road user: time until its front is in the middle of the hero's way.
+    User4Enters: "user_4_enters", "s", GAP, Around;
+    /// Fourth nearest road user: time until its rear has left the middle of the hero's way.
+    User4Leaves: "user_4_leaves", "s", GAP, Around;
+    /// Fourth nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User4Turn: "user_4_turn", "", SINE, Around;
     /// Fifth nearest road user: its middle, forward of the rear axle.
     User5X: "user_5_x", "m", NEAR, Around;
     /// Fifth nearest road user: its middle, to the left of the rear axle.
@@ -317,6 +357,16 @@ fields! {
     User5Length: "user_5_length", "m", LENGTH, Around;
     /// Fifth nearest road user: width, 0 for none.
     User5Width: "user_5_width", "m", WIDTH, Around;
+    /// Fifth nearest road user: distance along the route to where it will be in the hero's way.
+    User5Way: "user_5_way", "m", AHEAD, Around;
+    /// Fifth nearest road user: time until the hero is there at its speed.
+    User5Reaches: "user_5_reaches", "s", GAP, Around;
+    /// Fifth nearest road user: time until its front is in the middle of the hero's way.
+    User5Enters: "user_5_enters", "s", GAP, Around;
+    /// Fifth nearest road user: time until its rear has left the middle of the hero's way.
+    User5Leaves: "user_5_leaves", "s", GAP, Around;
+    /// Fifth nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User5Turn: "user_5_turn", "", SINE, Around;
     /// Sixth nearest road user: its middle, forward of the rear axle.
     User6X: "user_6_x", "m", NEAR, Around;
     /// Sixth nearest road user: its middle, to the left of the rear axle.
@@ -333,6 +383,16 @@ fields! {
     User6Length: "user_6_length", "m", LENGTH, Around;
     /// Sixth nearest road user: width, 0 for none.
     User6Width: "user_6_width", "m", WIDTH, Around;
+    /// Sixth nearest road user: distance along the route to where it will be in the hero's way.
+    User6Way: "user_6_way", "m", AHEAD, Around;
+    /// Sixth nearest road user: time until the hero is there at its speed.
+    User6Reaches: "user_6_reaches", "s", GAP, Around;
+    /// Sixth nearest road user: time until its front is in the middle of the hero's way.
+    User6Enters: "user_6_enters", "s", GAP, Around;
+    /// Sixth nearest road user: time until its rear has left the middle of the hero's way.
+    User6Leaves: "user_6_leaves", "s", GAP, Around;
+    /// Sixth nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User6Turn: "user_6_turn", "", SINE, Around;
     /// Seventh nearest road user: its middle, forward of the rear axle.
     User7X: "user_7_x", "m", NEAR, Around;
     /// Seventh nearest road user: its middle, to the left of the rear axle.
@@ -349,6 +409,16 @@ fields! {
     User7Length: "user_7_length", "m", LENGTH, Around;
     /// Seventh nearest road user: width, 0 for none.
     User7Width: "user_7_width", "m", WIDTH, Around;
+    /// Seventh nearest road user: distance along the route to where it will be in the hero's way.
+    User7Way: "user_7_way", "m", AHEAD, Around;
+    /// Seventh nearest road user: time until the hero is there at its speed.
+    User7Reaches: "user_7_reaches", "s", GAP, Around;
+    /// Seventh nearest road user: time until its front is in the middle of the hero's way.
+    User7Enters: "user_7_enters", "s", GAP, Around;
+    /// Seventh nearest road user: time until its rear has left the middle of the hero's way.
+    User7Leaves: "user_7_leaves", "s", GAP, Around;
+    /// Seventh nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User7Turn: "user_7_turn", "", SINE, Around;
     /// Eighth nearest road user: its middle, forward of the rear axle.
     User8X: "user_8_x", "m", NEAR, Around;
     /// Eighth nearest road user: its middle, to the left of the rear axle.
@@ -365,6 +435,16 @@ fields! {
     User8Length: "user_8_length", "m", LENGTH, Around;
     /// Eighth nearest road user: width, 0 for none.
     User8Width: "user_8_width", "m", WIDTH, Around;
+    /// Eighth nearest road user: distance along the route to where it will be in the hero's way.
+    User8Way: "user_8_way", "m", AHEAD, Around;
+    /// Eighth nearest road user: time until the hero is there at its speed.
+    User8Reaches: "user_8_reaches", "s", GAP, Around;
+    /// Eighth nearest road user: time until its front is in the middle of the hero's way.
+    User8Enters: "user_8_enters", "s", GAP, Around;
+    /// Eighth nearest road user: time until its rear has left the middle of the hero's way.
+    User8Leaves: "user_8_leaves", "s", GAP, Around;
+    /// Eighth nearest road user: 1 if it indicates a turn to the left, -1 to the right.
+    User8Turn: "user_8_turn", "", SINE, Around;
     /// Next junction of the route: distance to its stop line.
     Junction1Gap: "junction_1_gap", "m", SIGHT, Around;
     /// Next junction of the route: 1 with right of way, 0 without.
@@ -385,11 +465,11 @@ fields! {
     Junction3Rival: "junction_3_rival", "s", GAP, Around;
     /// Next traffic light of the route: distance to its stop line.
     Light1Gap: "light_1_gap", "m", SIGHT, Around;
-    /// Next traffic light of the route: 1 green, ½ yellow, 0 red.
+    /// Next traffic light of the route: 1 green, 0 red, yellow between them.
     Light1Green: "light_1_green", "", VALIDITY, Around;
     /// Second next traffic light of the route: distance to its stop line.
     Light2Gap: "light_2_gap", "m", SIGHT, Around;
-    /// Second next traffic light of the route: 1 green, ½ yellow, 0 red.
+    /// Second next traffic light of the route: 1 green, 0 red, yellow between them.
     Light2Green: "light_2_green", "", VALIDITY, Around;
     /// Nearest person beside the route: distance along the route.
     Person1Ahead: "person_1_ahead", "m", AHEAD, Around;
@@ -637,7 +717,7 @@ mod tests {
         let driver = names("driver");
         assert_eq!(driver[..16], driving);
         assert_eq!(driver.len(), 16 + AROUND);
-        assert_eq!((driver[16], driver[98]), ("user_1_x", "person_2_speed"));
+        assert_eq!((driver[16], driver[138]), ("user_1_x", "person_2_speed"));
         let (ultrasonic, caraware) = (names("ultrasonic"), names("caraware"));
         assert_eq!(ultrasonic[..11], caraware);
         assert_eq!(

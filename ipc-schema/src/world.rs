@@ -178,8 +178,12 @@ pub const SENSING_M: f64 = 50.0;
 /// Nearest road users that a hero senses.
 pub const SENSED_USERS: usize = 8;
 /// Numbers for each of them: x and y of its middle (m), cosine and sine of its heading, its velocity forward and to the left (m/s), all in
-/// the hero's body frame; length and width (m). Without a road user: both distances [`SENSING_M`], all others 0.
-pub const USER_COLUMNS: usize = 8;
+/// the hero's body frame; length and width (m). Then its encounter with the hero's way, if it keeps its speed and yaw rate: distance along
+/// the route from the front bumper to the first place where it will be in the way (m, [`SENSING_M`] for none), the times at which the hero
+/// reaches that place at its speed, at which the road user's front is in the middle of the way and at which its rear has left it (s, at most
+/// [`LONGEST_GAP_S`], which also stands for none). Last 1 if it indicates a turn to the left, -1 to the right, 0 neither. Without a road
+/// user: both coordinates and the distance [`SENSING_M`], the times [`LONGEST_GAP_S`], all others 0.
+pub const USER_COLUMNS: usize = 13;
 /// Next junctions of its route that a hero sees.
 pub const SEEN_CONFLICTS: usize = 3;
 /// Numbers for each of them: distance from the front bumper to its stop line (m), 1 if the hero has right of way there and 0 if not, and the
@@ -189,8 +193,8 @@ pub const CONFLICT_COLUMNS: usize = 3;
 pub const LONGEST_GAP_S: f64 = 10.0;
 /// Next traffic lights of its route that a hero sees.
 pub const SEEN_SIGNALS: usize = 2;
-/// Numbers for each of them: distance from the front bumper to its stop line (m), and 1 for green, ½ for yellow, 0 for red. Without a
-/// traffic light: [`SIGHT_M`], 1.
+/// Numbers for each of them: distance from the front bumper to its stop line (m), and 1 for green, 0 for red; yellow begins at ½ and falls
+/// by 0.15 a second to 0.05. Without a traffic light: [`SIGHT_M`], 1.
 pub const SIGNAL_COLUMNS: usize = 2;
 /// Nearest persons beside its route that a hero sees.
 pub const SEEN_PERSONS: usize = 2;

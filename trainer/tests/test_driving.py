@@ -15,7 +15,7 @@ from caraware.driving.trips import TripLog
 from caraware.ipc.channel import ENDED_BY
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.config import TrainerConfig
-from caraware.learn.encoders import EGO, FIELDS, GROUPS, GroupedNetwork
+from caraware.learn.encoders import EGO, FIELDS, GROUPS, GroupedNetwork, GroupEncoder
 from caraware.learn.networks import GaussianPolicy
 from caraware.learn.ppo import PlainUpdate
 from caraware.run.learner import begin_from
@@ -38,7 +38,7 @@ def network(outputs: int = 2) -> GroupedNetwork:
 
 
 def test_the_order_of_a_groups_members_does_not_matter_and_their_number_is_that_of_the_fields() -> None:
-    assert FIELDS == 99 and EGO == 16
+    assert FIELDS == 139 and EGO == 16
     rows, mixed = torch.rand(4, FIELDS) * 2 - 1, []
     at = EGO
     for group in GROUPS:
@@ -54,6 +54,20 @@ def test_the_order_of_a_groups_members_does_not_matter_and_their_number_is_that_
     assert not torch.allclose(net(other), net(rows), atol=1e-6), "a member counts"
     with pytest.raises(ValueError, match=r'observation\.fields = "driver"'):
         GroupedNetwork(16, 2, (16,))
+
+
+def test_members_are_encoded_beside_what_the_hero_itself_does() -> None:
+    net, rows = network(), torch.rand(4, FIELDS) * 2 - 1
+    with torch.no_grad():
+        # Without the direct way of the hero's own fields, they act through the encoders of members alone.
+        net.ego.weight.zero_()
+        faster = rows.clone()
+        faster[:, 0] += 0.5
+        assert not torch.allclose(net(faster), net(rows), atol=1e-6)
+        for encoder in net.groups:
+            assert isinstance(encoder, GroupEncoder) and encoder.context is not None
+            encoder.context.weight.zero_()
+        assert torch.equal(net(faster), net(rows))
 
 
 def test_the_teachers_action_is_what_the_ticks_after_it_show() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from caraware.tasks import driving
-from caraware.tasks.driving import careful_reward, progress_reward
+from caraware.tasks.driving import DrivenStep, careful_reward, progress_reward, yielding_reward
 from caraware.tasks.fields import Fields
 from caraware.tasks.foresight import HERO_M, HERO_MIDDLE_M, HERO_WIDTH_M, HORIZON_S, PERSONS, TIMES, USERS, Around
 from numpy.typing import NDArray
@@ -126,3 +126,62 @@ def test_a_foreseen_contact_costs_what_moves_and_a_failure_costs_more_than_it_ea
     ended = replace(near, ended=yes, failed=yes)
     assert careful_reward(ended).item() == -driving.CAREFUL_END_COST
     assert careful_reward(replace(near, ended=yes, arrived=yes)).item() == driving.END_REWARD
+
+
+JUNCTION = {
+    "junction_1_gap": (0.0, 100.0),
+    "junction_1_priority": (0.0, 1.0),
+    "light_1_gap": (0.0, 100.0),
+    "light_1_green": (0.0, 1.0),
+}
+
+
+def meets(speed: float, gap: float, priority: float, light: tuple[float, float] = (100.0, 1.0)) -> DrivenStep:
+    """A hero at `speed` that will touch what stands 5 m before it, at a junction and before a traffic light."""
+    leader = (HERO_MIDDLE_M + 4.6 + 5, 0.0, 1.0, 0.0, 0.0, 0.0, 4.6, 1.85)
+    seen = around((leader,), speed=speed)
+    values = (gap / 100, priority, light[0] / 100, light[1])
+    fields = Fields((*seen.fields.names, *JUNCTION), 1, 0.0, seen.fields._ranges | JUNCTION)
+    rows = torch.cat((seen.observation, torch.tensor([values])), 1)
+    return replace(
+        driven(),
+        speed_mps=torch.tensor([speed], dtype=torch.float64),
+        around=replace(seen, fields=fields, observation=rows),
+    )
+
+
+def test_who_has_to_wait_pays_more_for_a_foreseen_contact_and_creeping_into_it_costs() -> None:
+    def cost(speed: float, gap: float, priority: float) -> float:
+        step = meets(speed, gap, priority)
+        return (progress_reward(step) - yielding_reward(step)).item()
+
+    assert cost(8.0, 5.0, 1.0) == pytest.approx(driving.PRIORITY_SHARE * cost(8.0, 5.0, 0.0))
+    assert cost(8.0, 50.0, 1.0) == cost(8.0, 50.0, 0.0), "a junction that is far off decides nothing"
+    near = (1 - 0.625 / HORIZON_S) ** 2
+    assert cost(10.0, 5.0, 0.0) == pytest.approx(driving.YIELDING_COST * near, rel=0.3)
+    creeps = meets(3.0, 5.0, 0.0)
+    assert cost(3.0, 5.0, 0.0) > 1.5 * (progress_reward(creeps) - careful_reward(creeps)).item() > 0
+    assert cost(0.0, 5.0, 0.0) == pytest.approx(driving.WAITING_COST)
+    yes = torch.ones(1, dtype=torch.bool)
+    ended = replace(meets(8.0, 5.0, 0.0), ended=yes, failed=yes)
+    assert yielding_reward(ended).item() == -driving.YIELDING_END_COST
+    assert yielding_reward(replace(ended, failed=~yes, arrived=yes)).item() == driving.END_REWARD
+
+
+def test_late_braking_for_red_costs_and_for_no_other_light() -> None:
+    def cost(speed: float, gap: float, green: float) -> float:
+        step, free = (meets(speed, 50.0, 0.0, light) for light in ((gap, green), (100.0, 1.0)))
+        return (yielding_reward(free) - yielding_reward(step)).item()
+
+    # From 10 m/s: 16.7 m at 3 m/s², 7.1 m at 7 m/s², and half a metre.
+    assert cost(10.0, 20.0, 0.0) == 0.0
+    assert cost(10.0, 10.5, 0.0) == pytest.approx(driving.RED_COST / 2, rel=1e-3)
+    assert cost(10.0, 5.0, 0.0) == pytest.approx(driving.RED_COST)
+    assert cost(10.0, 5.0, 0.05) == cost(10.0, 5.0, 1.0) == 0.0
+
+
+def test_without_junctions_and_lights_in_the_row_nothing_is_known_of_them() -> None:
+    step = replace(driven(), around=around(speed=10.0))
+    assert step.seen("light_1_gap", 7.0).tolist() == [7.0]
+    assert replace(step, around=None).seen("user_1_x", 7.0).tolist() == [7.0]
+    assert yielding_reward(step).item() == progress_reward(step).item()

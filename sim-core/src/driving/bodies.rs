@@ -4,6 +4,10 @@ use ipc_schema::{traffic::Kind, world::VehicleState};
 
 use super::{PERSON_ROOM_M, ahead_by};
 
+/// Bits of SUMO's vehicle signals.
+const BLINKS_RIGHT: u32 = 1;
+const BLINKS_LEFT: u32 = 2;
+
 /// All road users of a tick, in their rows.
 #[derive(Debug, Clone, Default)]
 pub struct TickBodies {
@@ -69,6 +73,12 @@ pub struct TickBody {
     pub velocity_mps: [f64; 2],
     /// Length of the velocity, m/s.
     pub speed_mps: f64,
+    /// Cosine and sine of its heading.
+    pub heading: [f64; 2],
+    /// Rate of its heading, rad/s.
+    pub yaw_rate_radps: f64,
+    /// What it indicates: 1 a turn to the left, -1 to the right, 0 neither or both.
+    pub turn: f32,
     /// Metres.
     pub length_m: f32,
     /// Metres.
@@ -100,6 +110,13 @@ impl TickBody {
             origin_m: [state.x_m, state.y_m],
             velocity_mps: [vx, vy],
             speed_mps: libm::sqrt(vx * vx + vy * vy),
+            heading: [cos, sin],
+            yaw_rate_radps: f64::from(state.angular_rate_body_radps[2]),
+            turn: match state.signals & (BLINKS_RIGHT | BLINKS_LEFT) {
+                BLINKS_LEFT => 1.0,
+                BLINKS_RIGHT => -1.0,
+                _ => 0.0,
+            },
             length_m: state.length_m,
             width_m: state.width_m,
             is_person,

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc};
 use ipc_schema::{
     config,
     ego::EgoPose,
-    traffic::{Kind, RoutePoint, SIGNAL_LINKS, SignalMeta},
+    traffic::{Kind, RoutePoint, SignalMeta},
     world::{
         ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, BLOCKED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD,
         RED_LIGHT, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState, vehicle_of,
@@ -14,6 +14,7 @@ use ipc_schema::{
 
 pub mod action;
 pub mod bodies;
+pub mod encounter;
 pub mod ports;
 pub mod route;
 pub mod surroundings;
@@ -22,6 +23,7 @@ use crate::{models::state::ControlInput, scene::Scene};
 use action::HeroAction;
 use bodies::TickBodies;
 use route::HeroRoute;
+use surroundings::ShownLight;
 
 /// A hero that is beside the road for this long is off the road, seconds.
 const OFF_ROAD_AFTER_S: f64 = 0.5;
@@ -114,6 +116,15 @@ struct HeroTrip {
     over: bool,
 }
 
+/// A link of a traffic light.
+#[derive(Debug, Clone, Copy, Default)]
+struct SignalLink {
+    /// SUMO's letter.
+    letter: u8,
+    /// Tick of the episode since which it is shown.
+    since: u64,
+}
+
 /// All heroes of the current episode.
 #[derive(Debug)]
 pub struct DrivingTask<G> {
@@ -127,8 +138,11 @@ pub struct DrivingTask<G> {
     blocked_ticks: Option<u64>,
     episode: Option<u64>,
     trips: BTreeMap<u32, HeroTrip>,
-    /// Letters of each traffic light's links.
-    signals: BTreeMap<u32, [u8; SIGNAL_LINKS]>,
+    /// Links of each traffic light.
+    signals: BTreeMap<u32, Vec<SignalLink>>,
+    tick_s: f64,
+    /// Of this episode.
+    ticks: u64,
     counts: HeroCounts,
 }
 
@@ -148,6 +162,8 @@ impl<G: DrivableGround> DrivingTask<G> {
             episode: None,
             trips: BTreeMap::new(),
             signals: BTreeMap::new(),
+            tick_s: config.run.tick_s,
+            ticks: 0,
             counts: HeroCounts::default(),
         }
     }
@@ -174,6 +190,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             self.episode = Some(episode);
             self.trips.clear();
             self.signals.clear();
+            self.ticks = 0;
         }
     }
 
@@ -191,7 +208,16 @@ impl<G: DrivableGround> DrivingTask<G> {
     /// Takes states of traffic lights.
     pub fn add_signals(&mut self, signals: &[SignalMeta]) {
         for signal in signals {
-            self.signals.insert(signal.signal, signal.state);
+            let links = self.signals.entry(signal.signal).or_default();
+            links.resize(signal.links as usize, SignalLink::default());
+            for (link, letter) in links.iter_mut().zip(signal.state) {
+                if link.letter != letter {
+                    *link = SignalLink {
+                        letter,
+                        since: self.ticks,
+                    };
+                }
+            }
         }
     }
 
@@ -220,6 +246,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     /// Ends a tick, after all road users have moved and contacts are known: sets the flags of heroes in `states` and returns their poses
     /// for SUMO.
     pub fn end_tick(&mut self, states: &mut [VehicleState]) -> Vec<EgoPose> {
+        self.ticks += 1;
         let mut poses = Vec::new();
         for state in states.iter_mut().filter(|state| state.kind == Kind::Hero as u32) {
             let mut trip = self.trips.remove(&state.vehicle).unwrap_or_default();
@@ -267,7 +294,20 @@ impl<G: DrivableGround> DrivingTask<G> {
 
     /// The letter of the link at a stop line; `None` if its traffic light is not known.
     fn letter(&self, stop: &route::StopLine) -> Option<u8> {
-        self.signals.get(&stop.signal)?.get(stop.link as usize).copied()
+        self.link(stop).map(|link| link.letter)
+    }
+
+    fn link(&self, stop: &route::StopLine) -> Option<&SignalLink> {
+        self.signals.get(&stop.signal)?.get(stop.link as usize)
+    }
+
+    /// What a stop line's traffic light shows; `None` if it is not known.
+    fn light(&self, stop: &route::StopLine) -> Option<ShownLight> {
+        let link = self.link(stop)?;
+        Some(ShownLight {
+            letter: link.letter,
+            shown_s: (self.ticks - link.since) as f64 * self.tick_s,
+        })
     }
 
     /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
@@ -354,7 +394,7 @@ impl<G: DrivableGround> DrivingTask<G> {
                 station_m,
                 front_station_m,
             }
-            .numbers(|stop| self.letter(stop)),
+            .numbers(|stop| self.light(stop)),
         }
     }
 

@@ -10,6 +10,7 @@ use ipc_schema::world::{
 
 use super::{
     bodies::{TickBodies, TickBody},
+    encounter::HeroWay,
     is_trailing_body_of,
     route::{Crossing, HeroRoute, StopLine},
 };
@@ -24,6 +25,30 @@ const PLACES: u32 = 5;
 const RIVAL_SIGHT_M: f64 = 80.0;
 /// A stop line this near to the beginning of a way across a junction is that way's, metres.
 const SAME_LINE_M: f64 = 1.0;
+
+/// Row of a road user that is not there.
+const NO_USER: [f32; USER_COLUMNS] = {
+    let (far_m, never_s) = (SENSING_M as f32, LONGEST_GAP_S as f32);
+    [
+        far_m, far_m, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, far_m, never_s, never_s, never_s, 0.0,
+    ]
+};
+/// What a green light, a red one and one that has just turned yellow count as.
+const GREEN: f64 = 1.0;
+const RED: f64 = 0.0;
+const YELLOW: f64 = 0.5;
+/// What a yellow light loses in a second, and what it keeps.
+const YELLOW_FADES_PER_S: f64 = 0.15;
+const LAST_YELLOW: f64 = 0.05;
+
+/// What a link of a traffic light shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ShownLight {
+    /// SUMO's letter.
+    pub letter: u8,
+    /// For how long, seconds.
+    pub shown_s: f64,
+}
 
 /// A hero among the road users of a tick.
 #[derive(Debug)]
@@ -51,17 +76,18 @@ struct Neighbour<'a> {
 }
 
 impl HeroSurroundings<'_> {
-    /// The numbers of [`ipc_schema::world::HeroView::around`]; `letter` is that of a stop line's link.
+    /// The numbers of [`ipc_schema::world::HeroView::around`]; `light` is that of a stop line's link.
     #[must_use]
-    pub fn numbers(&self, letter: impl Fn(&StopLine) -> Option<u8>) -> [f32; AROUND] {
+    pub fn numbers(&self, light: impl Fn(&StopLine) -> Option<ShownLight>) -> [f32; AROUND] {
         let mut numbers = [0.0; AROUND];
         let (persons_near, vehicles_near): (Vec<_>, Vec<_>) = self.neighbours().partition(|other| other.body.is_person);
         let (users, rest) = numbers.split_at_mut(SENSED_USERS * USER_COLUMNS);
         let (junctions, rest) = rest.split_at_mut(SEEN_CONFLICTS * CONFLICT_COLUMNS);
         let (lights, persons) = rest.split_at_mut(SEEN_SIGNALS * SIGNAL_COLUMNS);
         self.write_users(&vehicles_near, users);
+        let letter = |stop: &StopLine| light(stop).map(|light| light.letter);
         self.write_junctions(&vehicles_near, &letter, junctions);
-        self.write_lights(&letter, lights);
+        self.write_lights(&light, lights);
         self.write_persons(persons_near, persons);
         numbers
     }
@@ -89,12 +115,13 @@ impl HeroSurroundings<'_> {
 
     fn write_users(&self, vehicles: &[Neighbour<'_>], numbers: &mut [f32]) {
         let hero = self.hero();
+        let way = HeroWay::new(self.route, self.front_station_m, hero);
         let (sin, cos) = libm::sincos(hero.yaw_rad);
         let turned = |[x, y]: [f64; 2]| [cos * x + sin * y, cos * y - sin * x];
         let mut users = nearest_users(vehicles).into_iter().flatten();
         for row in numbers.as_chunks_mut::<USER_COLUMNS>().0 {
             *row = match users.next() {
-                None => [SENSING_M as f32, SENSING_M as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+                None => NO_USER,
                 Some(other) => {
                     let [x, y] = other.body.middle_m;
                     let [x, y] = turned([x - hero.x_m, y - hero.y_m]);
@@ -102,8 +129,14 @@ impl HeroSurroundings<'_> {
                     let (sine, cosine) = libm::sincos(other.state.yaw_rad - hero.yaw_rad);
                     let [x, y, cosine, sine, forward, left] =
                         [x, y, cosine, sine, forward, left].map(|value| value as f32);
-                    let (length_m, width_m) = (other.body.length_m, other.body.width_m);
-                    [x, y, cosine, sine, forward, left, length_m, width_m]
+                    let (length_m, width_m, turn) = (other.body.length_m, other.body.width_m, other.body.turn);
+                    let met = way.encounter(other.body);
+                    let [way_m, reaches_s, enters_s, leaves_s] =
+                        [met.way_m, met.reaches_s, met.enters_s, met.leaves_s].map(|value| value as f32);
+                    [
+                        x, y, cosine, sine, forward, left, length_m, width_m, way_m, reaches_s, enters_s, leaves_s,
+                        turn,
+                    ]
                 }
             };
         }
@@ -171,22 +204,18 @@ impl HeroSurroundings<'_> {
         soonest_s
     }
 
-    fn write_lights(&self, letter: &impl Fn(&StopLine) -> Option<u8>, numbers: &mut [f32]) {
+    fn write_lights(&self, light: &impl Fn(&StopLine) -> Option<ShownLight>, numbers: &mut [f32]) {
         let is_ahead = |stop: &&StopLine| {
             let ahead_m = stop.station_m - self.front_station_m;
-            (0.0..SIGHT_M).contains(&ahead_m) && !letter(stop).is_some_and(is_off)
+            (0.0..SIGHT_M).contains(&ahead_m) && !light(stop).is_some_and(|light| is_off(light.letter))
         };
         let mut stops = self.route.stop_lines().iter().filter(is_ahead);
         for row in numbers.as_chunks_mut::<SIGNAL_COLUMNS>().0 {
             *row = match stops.next() {
                 None => [SIGHT_M as f32, 1.0],
                 Some(stop) => {
-                    let green = match letter(stop) {
-                        Some(b'r' | b'R') => 0.0,
-                        Some(b'y' | b'Y' | b'u') => 0.5,
-                        _ => 1.0,
-                    };
-                    [(stop.station_m - self.front_station_m) as f32, green]
+                    let green = light(stop).map_or(GREEN, greenness);
+                    [(stop.station_m - self.front_station_m) as f32, green as f32]
                 }
             };
         }
@@ -232,6 +261,15 @@ fn nearest_users<'a>(vehicles: &'a [Neighbour<'a>]) -> [Option<&'a Neighbour<'a>
         }
     }
     nearest
+}
+
+/// How near a light is to green. Yellow tells since when it is shown: how long it lasts decides whether a driver can still pass.
+fn greenness(light: ShownLight) -> f64 {
+    match light.letter {
+        b'r' | b'R' => RED,
+        b'y' | b'Y' | b'u' => (YELLOW - YELLOW_FADES_PER_S * light.shown_s).max(LAST_YELLOW),
+        _ => GREEN,
+    }
 }
 
 /// True for a link whose traffic light is off, blinking or not.
@@ -290,37 +328,50 @@ mod tests {
             station_m: 58.0,
             front_station_m: 60.0,
         };
-        hero.numbers(|_| letter)
+        hero.numbers(|_| letter.map(|letter| ShownLight { letter, shown_s: 0.0 }))
     }
 
     #[test]
     fn with_nothing_around_every_number_says_so() {
         let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
         let numbers = seen(&[hero], None);
-        assert_eq!(numbers[..8], [50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        assert_eq!(numbers[64..70], [40.0, 0.0, 10.0, 100.0, 1.0, 10.0]);
-        assert_eq!(numbers[73..77], [40.0, 1.0, 100.0, 1.0]);
-        assert_eq!(numbers[77..], [50.0, 10.0, 0.0, 50.0, 10.0, 0.0]);
+        assert_eq!(
+            numbers[..13],
+            [50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 50.0, 10.0, 10.0, 10.0, 0.0]
+        );
+        assert_eq!(numbers[104..110], [40.0, 0.0, 10.0, 100.0, 1.0, 10.0]);
+        assert_eq!(numbers[113..117], [40.0, 1.0, 100.0, 1.0]);
+        assert_eq!(numbers[117..], [50.0, 10.0, 0.0, 50.0, 10.0, 0.0]);
     }
 
     #[test]
     fn road_users_stand_by_distance_in_the_heros_frame() {
         let north = std::f64::consts::FRAC_PI_2;
         let hero = user(Kind::Hero, [58.0, 0.0], north, 10.0);
-        let far = user(Kind::Other, [58.0, 30.0], 0.0, 5.0);
+        let far = VehicleState {
+            signals: 2,
+            ..user(Kind::Other, [58.0, 30.0], 0.0, 5.0)
+        };
         let near = user(Kind::Cav, [48.0, 0.0], north, 8.0);
         let unseen = user(Kind::Other, [58.0, -60.0], 0.0, 5.0);
         let numbers = seen(&[hero, far, near, unseen], None);
         let rounded = |from: usize| -> Vec<f32> {
-            numbers[from..from + 8]
+            numbers[from..from + 13]
                 .iter()
                 .map(|n| (n * 1e3).round() / 1e3)
                 .collect()
         };
-        // 10 m to the left, driving alike; then 30 m ahead, driving to the right.
-        assert_eq!(rounded(0), [0.0, 10.0, 1.0, 0.0, 8.0, 0.0, 4.0, 2.0]);
-        assert_eq!(rounded(8), [30.0, 0.0, 0.0, -1.0, 0.0, -5.0, 4.0, 2.0]);
-        assert_eq!(numbers[16], 50.0);
+        // 10 m to the left, driving alike: it drives away from the route, which leads to the right.
+        assert_eq!(
+            rounded(0),
+            [0.0, 10.0, 1.0, 0.0, 8.0, 0.0, 4.0, 2.0, 50.0, 10.0, 10.0, 10.0, 0.0]
+        );
+        // 30 m ahead, driving to the right, which it does not indicate: it indicates a turn to the left.
+        assert_eq!(
+            rounded(13),
+            [30.0, 0.0, 0.0, -1.0, 0.0, -5.0, 4.0, 2.0, 50.0, 10.0, 10.0, 10.0, 1.0]
+        );
+        assert_eq!(numbers[26], 50.0);
     }
 
     #[test]
@@ -329,7 +380,7 @@ mod tests {
         let others =
             [9.0, 4.0, 7.0, 2.0, -2.0, 8.0, 3.0, 6.0, 5.0, 1.0].map(|y_m| user(Kind::Other, [58.0, y_m], 0.0, 0.0));
         let states: Vec<VehicleState> = std::iter::once(hero).chain(others).collect();
-        let left: Vec<f32> = (0..8).map(|row| seen(&states, None)[row * 8 + 1]).collect();
+        let left: Vec<f32> = (0..8).map(|row| seen(&states, None)[row * USER_COLUMNS + 1]).collect();
         assert_eq!(left, [1.0, 2.0, -2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
     }
 
@@ -343,8 +394,8 @@ mod tests {
         let leaving = user(Kind::Other, [110.0, -20.0], south, 10.0);
         let waiting = user(Kind::Other, [115.0, 20.0], south, 0.0);
         let numbers = seen(&[hero, rival, leader, leaving, waiting], None);
-        assert_eq!(numbers[64..67], [40.0, 0.0, 4.0]);
-        assert_eq!(seen(&[hero, leader, leaving, waiting], None)[66], 10.0);
+        assert_eq!(numbers[104..107], [40.0, 0.0, 4.0]);
+        assert_eq!(seen(&[hero, leader, leaving, waiting], None)[106], 10.0);
     }
 
     #[test]
@@ -362,13 +413,25 @@ mod tests {
         ] {
             let numbers = seen(&[hero, person], Some(letter));
             assert_eq!(
-                (numbers[65], [numbers[73], numbers[74]]),
+                (numbers[105], [numbers[113], numbers[114]]),
                 (priority, light),
                 "{}",
                 letter as char
             );
-            assert_eq!(numbers[77..80], [20.0, -4.0, 1.5]);
+            assert_eq!(numbers[117..120], [20.0, -4.0, 1.5]);
             assert_eq!(numbers[0], 50.0, "a person is no vehicle");
+        }
+    }
+
+    #[test]
+    fn yellow_fades_and_nothing_else_does() {
+        let shown = |letter, shown_s| greenness(ShownLight { letter, shown_s });
+        for (shown_s, yellow) in [(0.0, 0.5), (1.0, 0.35), (3.0, 0.05), (60.0, 0.05)] {
+            assert!((shown(b'y', shown_s) - yellow).abs() < 1e-9);
+            assert_eq!(
+                (shown(b'G', shown_s), shown(b'g', shown_s), shown(b'r', shown_s)),
+                (1.0, 1.0, 0.0)
+            );
         }
     }
 }

@@ -1,6 +1,6 @@
 use ipc_schema::{
-    traffic::{NO_SIGNAL, RoutePoint},
-    world::{SENSING_M, USER_COLUMNS, trailing_index},
+    traffic::{NO_SIGNAL, RoutePoint, SIGNAL_LINKS},
+    world::{CONFLICT_COLUMNS, SEEN_CONFLICTS, SENSED_USERS, SENSING_M, USER_COLUMNS, trailing_index},
 };
 use proptest::prelude::*;
 
@@ -284,4 +284,36 @@ proptest! {
         let expected = leader_by_search(&route, station_m, &states);
         prop_assert_eq!(leader(&route, station_m, 0, (&states, &bodies)), expected);
     }
+}
+
+#[test]
+fn a_hero_sees_since_when_a_light_is_yellow() {
+    let mut driving = driving();
+    let signal = |letter| {
+        let mut state = [0; SIGNAL_LINKS];
+        state[2] = letter;
+        SignalMeta {
+            signal: 5,
+            links: 3,
+            state,
+            ..bytemuck::Zeroable::zeroed()
+        }
+    };
+    let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
+    let mut green = |driving: &mut DrivingTask<Strip>| {
+        let (view, _) = tick(driving, &mut states);
+        let lights = SENSED_USERS * USER_COLUMNS + SEEN_CONFLICTS * CONFLICT_COLUMNS;
+        (view.around[lights + 1] * 1e3).round() / 1e3
+    };
+    driving.add_signals(&[signal(b'G')]);
+    assert_eq!([green(&mut driving), green(&mut driving)], [1.0, 1.0]);
+    // The state comes with other changes, too: only a new letter begins anew.
+    driving.add_signals(&[signal(b'y')]);
+    assert_eq!([green(&mut driving), green(&mut driving)], [0.485, 0.47]);
+    driving.add_signals(&[signal(b'y')]);
+    assert_eq!(green(&mut driving), 0.455);
+    driving.add_signals(&[signal(b'r')]);
+    assert_eq!(green(&mut driving), 0.0);
+    driving.add_signals(&[signal(b'y')]);
+    assert_eq!(green(&mut driving), 0.485);
 }

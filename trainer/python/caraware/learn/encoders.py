@@ -31,28 +31,37 @@ class Group:
     columns: int
 
 
-GROUPS = (Group("user", 8, 8), Group("junction", 3, 3), Group("light", 2, 2), Group("person", 2, 3))
+GROUPS = (Group("user", 8, 13), Group("junction", 3, 3), Group("light", 2, 2), Group("person", 2, 3))
 """In the order of the preset "driver" (ipc-schema/src/field.rs)."""
 FIELDS = EGO + sum(group.members * group.columns for group in GROUPS)
 
 
 class GroupEncoder(nn.Module):
-    """Members `[b, m, c]` to `[b, ENCODED]`: two layers for each member, then the maximum over them."""
+    """Members `[b, m, c]` to `[b, ENCODED]`: two layers for each member, then the maximum over them.
 
-    def __init__(self, columns: int) -> None:
+    With `context`, each member is encoded beside `[b, context]` numbers that all of a row share.
+    """
+
+    def __init__(self, columns: int, context: int = 0) -> None:
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(columns, ENCODED), nn.ReLU(), nn.Linear(ENCODED, ENCODED))
+        self.context = nn.Linear(context, ENCODED, bias=False) if context else None
 
-    def forward(self, members: Tensor) -> Tensor:
+    def forward(self, members: Tensor, context: Tensor | None = None) -> Tensor:
         """See the class."""
-        pooled: Tensor = self.layers(members).amax(1)
-        return pooled
+        first, *rest = self.layers
+        seen: Tensor = first(members)
+        if self.context is not None and context is not None:
+            seen = seen + self.context(context).unsqueeze(1)
+        for layer in rest:
+            seen = layer(seen)
+        return seen.amax(1)
 
 
 class GroupedNetwork(nn.Module):
     """Rows `[b, inputs]` of the preset "driver" to `[b, outputs]`, through encoders and tanh layers.
 
-    `inputs` is a multiple of the 99 fields if the observation has a history: its ticks are encoded by the same
+    `inputs` is a multiple of the 139 fields if the observation has a history: its ticks are encoded by the same
     encoders and stand side by side. Raises `ValueError` for rows of other fields.
     """
 
@@ -64,7 +73,7 @@ class GroupedNetwork(nn.Module):
             )
         self.ticks = inputs // FIELDS
         self.ego = nn.Linear(EGO, 2 * ENCODED)
-        self.groups = nn.ModuleList(GroupEncoder(group.columns) for group in GROUPS)
+        self.groups = nn.ModuleList(GroupEncoder(group.columns, EGO) for group in GROUPS)
         widths = (self.ticks * (2 + len(GROUPS)) * ENCODED, *hidden)
         layers: list[nn.Module] = []
         for before, after in pairwise(widths):
@@ -81,10 +90,12 @@ class GroupedNetwork(nn.Module):
     def forward(self, rows: Tensor) -> Tensor:
         """See the class."""
         ticks = rows.view(len(rows) * self.ticks, FIELDS)
-        encoded, at = [self.ego(ticks[:, :EGO])], EGO
+        ego = ticks[:, :EGO]
+        encoded, at = [self.ego(ego)], EGO
         for group, encoder in zip(GROUPS, self.groups, strict=True):
             width = group.members * group.columns
-            encoded.append(encoder(ticks[:, at : at + width].reshape(-1, group.members, group.columns)))
+            members = ticks[:, at : at + width].reshape(-1, group.members, group.columns)
+            encoded.append(encoder(members, ego))
             at += width
         seen = torch.cat(encoded, 1).relu()
         out: Tensor = self.trunk(seen.view(len(rows), -1))

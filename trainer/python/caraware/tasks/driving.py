@@ -38,6 +38,14 @@ WAITING_COST, WAITS_MPS = 0.02, 1.0
 """Of a tick slower than that: as much as 20 cm of progress."""
 CAREFUL_END_COST = 15.0
 """Of an end of its own other than an arrival, by `careful_reward`."""
+YIELDING_END_COST, YIELDING_COST = 20.0, 0.6
+"""The same by `yielding_reward`, and its cost of a contact that is about to happen at 10 m/s."""
+PRIORITY_SHARE, PRIORITY_WITHIN_M = 0.7, 10.0
+"""Of that cost for a hero with right of way at a junction that is this near."""
+RED_COST, RED_BRAKING_MPS2, RED_HARDEST_MPS2 = 0.3, 3.0, 7.0
+"""Of a tick before a red light that only the last braking still stops at; none at the first."""
+RED_GREEN = 0.02
+"""A light below this is red: yellow ends at 0.05."""
 
 
 ACTIONS = ActionSpec(
@@ -87,7 +95,7 @@ class DrivenStep:
     action: Tensor
     """f `[n, 2]`: steering and acceleration as the policy chose them."""
     around: Around | None = None
-    """What moves around them after the tick, for `contact_s`."""
+    """What they see after the tick, for `contact_s` and `seen`."""
 
     @cached_property
     def contact_s(self) -> Tensor:
@@ -96,6 +104,12 @@ class DrivenStep:
         Only the fields of `observation.fields = "driver"` show it: infinite without them.
         """
         return torch.full_like(self.progress_m, torch.inf) if self.around is None else self.around.contact_s()
+
+    def seen(self, field: str, without: float) -> Tensor:
+        """f64 `[n]`: a field of the observation after the tick in SI units, or `without` where it lacks the field."""
+        if self.around is None or not self.around.fields.has(field):
+            return torch.full_like(self.progress_m, without)
+        return self.around.fields.si_tensor(self.around.observation, field)
 
 
 DrivingReward = Callable[[DrivenStep], Tensor]
@@ -128,6 +142,26 @@ def careful_reward(step: DrivenStep) -> Tensor:
     near = (1 - step.contact_s / HORIZON_S).clamp(0, 1)
     cost = FORESEEN_COST * (step.speed_mps / 10) * near.square() + WAITING_COST * (step.speed_mps < WAITS_MPS)
     return torch.where(step.ended & step.failed, -CAREFUL_END_COST, progress_reward(step) - cost * ~step.ended)
+
+
+def yielding_reward(step: DrivenStep) -> Tensor:
+    """`careful_reward` with costs by right of way and of late braking for red; a failure costs 20.
+
+    A foreseen contact costs half as much at 3 m/s as at 10 m/s, because heroes that creep into a junction are hit
+    there. A hero with right of way pays a part of it. A red light costs where a stop needs more than 3 m/s².
+    """
+    near = (1 - step.contact_s / HORIZON_S).clamp(0, 1)
+    pace = (step.speed_mps / 3).clamp(0, 1) * (0.3 + 0.07 * step.speed_mps)
+    has_priority = (step.seen("junction_1_gap", torch.inf) < PRIORITY_WITHIN_M) & (
+        step.seen("junction_1_priority", 0.0) > 0.5
+    )
+    cost = YIELDING_COST * torch.where(has_priority, PRIORITY_SHARE, 1.0) * pace * near.square()
+    stop_m = step.seen("light_1_gap", torch.inf)
+    braking_mps2 = step.speed_mps.square() / (2 * (stop_m - 0.5).clamp_min(0.3))
+    late = ((braking_mps2 - RED_BRAKING_MPS2) / (RED_HARDEST_MPS2 - RED_BRAKING_MPS2)).clamp(0, 1)
+    cost = cost + RED_COST * late * (step.seen("light_1_green", 1.0) < RED_GREEN)
+    cost = cost + WAITING_COST * (step.speed_mps < WAITS_MPS)
+    return torch.where(step.ended & step.failed, -YIELDING_END_COST, progress_reward(step) - cost * ~step.ended)
 
 
 @dataclass(frozen=True)
