@@ -150,7 +150,7 @@ def meets(speed: float, gap: float, priority: float, light: tuple[float, float] 
     )
 
 
-def test_who_has_to_wait_pays_more_for_a_foreseen_contact_and_creeping_into_it_costs() -> None:
+def test_a_hero_that_has_to_wait_pays_more_for_a_foreseen_contact_and_creeping_into_it_costs() -> None:
     def cost(speed: float, gap: float, priority: float) -> float:
         step = meets(speed, gap, priority)
         return (progress_reward(step) - yielding_reward(step)).item()

@@ -209,7 +209,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     pub fn add_signals(&mut self, signals: &[SignalMeta]) {
         for signal in signals {
             let links = self.signals.entry(signal.signal).or_default();
-            links.resize(signal.links as usize, SignalLink::default());
+            links.resize((signal.links as usize).min(signal.state.len()), SignalLink::default());
             for (link, letter) in links.iter_mut().zip(signal.state) {
                 if link.letter != letter {
                     *link = SignalLink {
