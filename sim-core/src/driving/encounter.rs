@@ -6,8 +6,10 @@ use super::{bodies::TickBody, route::HeroRoute};
 
 /// Distance between the places of the way that are compared with a road user, metres: less than any two bodies are wide.
 const SPACING_M: f64 = 1.5;
+/// Part of a way that the hero itself covers, at most, metres.
+const BEHIND_M: f64 = 15.0;
 /// Places of a way: from the hero's rear bumper to [`SENSING_M`] before its front bumper.
-const PLACES: usize = 40;
+const PLACES: usize = 45;
 /// Room between two bodies that still counts as a meeting, metres.
 const ROOM_M: f64 = 0.3;
 /// A slower road user stands, m/s.
@@ -57,7 +59,7 @@ impl HeroWay {
     /// The way of a hero with its front bumper at a station of its route.
     #[must_use]
     pub fn new(route: &HeroRoute, front_station_m: f64, hero: &VehicleState) -> Self {
-        let first_m = -f64::from(hero.length_m).min(0.25 * PLACES as f64 * SPACING_M);
+        let first_m = -f64::from(hero.length_m).min(BEHIND_M);
         let end_m = (route.length_m() - front_station_m).min(SENSING_M);
         let mut way = Self {
             places_m: [[0.0; 2]; PLACES],
@@ -171,8 +173,8 @@ mod tests {
 
     use super::*;
 
-    /// 200 m along x.
-    fn way() -> HeroWay {
+    /// The way of a hero that long, in the middle of 200 m along x.
+    fn way_of(length_m: f32) -> HeroWay {
         let mut route = HeroRoute::default();
         for (x_m, index) in [(0.0, 0), (200.0, 1)] {
             route.push(&RoutePoint {
@@ -182,12 +184,16 @@ mod tests {
             });
         }
         let hero = VehicleState {
-            length_m: 4.5,
+            length_m,
             width_m: 2.0,
             velocity_body_mps: [9.0, 0.0, 0.0],
             ..VehicleState::default()
         };
         HeroWay::new(&route, 100.0, &hero)
+    }
+
+    fn way() -> HeroWay {
+        way_of(4.5)
     }
 
     fn car([x_m, y_m]: [f64; 2], yaw_rad: f64, speed_mps: f32, yaw_rate_radps: f32) -> TickBody {
@@ -238,6 +244,14 @@ mod tests {
         assert_eq!(seen(&car([130.0, 8.0], -1.0, 0.0, 0.0)), NONE);
         // Oncoming in the hero's lane.
         assert_eq!(seen(&car([130.0, 0.0], std::f64::consts::PI, 10.0, 0.0))[0], 0.0);
+    }
+
+    #[test]
+    fn a_way_reaches_as_far_before_a_long_hero_as_before_a_short_one() {
+        for length_m in [2.0, 4.5, 12.0, 18.0] {
+            let seen = way_of(length_m).encounter(&car([150.0, 0.0], 0.0, 0.0, 0.0));
+            assert!((seen.way_m - 48.0).abs() <= SPACING_M, "{length_m} m: {seen:?}");
+        }
     }
 
     #[test]
