@@ -8,7 +8,9 @@
 
 use std::path::{Path, PathBuf};
 
-use ipc_schema::{SCHEMA_VERSION, channel::Channel, header::MessageHeader, observation::ObservationLayout};
+use ipc_schema::{
+    SCHEMA_VERSION, channel::Channel, config::ChunkCompression, header::MessageHeader, observation::ObservationLayout,
+};
 use recorder::{
     diff::{self, FieldDifference},
     file::{
@@ -22,6 +24,7 @@ const TICKS: u64 = 60;
 /// Ticks in a chunk.
 const CHUNK: u64 = 7;
 const CHUNKS: ChunkOptions = ChunkOptions {
+    compression: ChunkCompression::Zstd,
     compression_level: 1,
     chunk_mib: 4,
 };
@@ -123,27 +126,45 @@ fn place(directory: &tempfile::TempDir, name: &str) -> PathBuf {
     directory.path().join(name)
 }
 
+/// The end of each observation repeats its beginning, so that there is something to find.
+fn repeat_beginning(_: u64, payload: &mut [u8], _: &ObservationLayout) {
+    let (first, second) = payload.split_at_mut(payload.len() * 3 / 4);
+    second.copy_from_slice(&first[..second.len()]);
+}
+
 #[test]
-fn a_level_changes_the_size_of_a_recording_and_nothing_else() {
+fn compression_and_level_change_the_size_of_a_recording_and_nothing_else() {
     let directory = tempfile::tempdir().unwrap();
-    let packed = [-50, -3, 0, 1, 19].map(|compression_level| {
-        let path = place(&directory, &format!("level{compression_level}.mcap"));
+    let packed = |compression: ChunkCompression, compression_level: i32| {
+        let path = place(&directory, &format!("{compression:?}{compression_level}.mcap"));
         let chunks = ChunkOptions {
+            compression,
             compression_level,
             ..CHUNKS
         };
-        // Half of each observation repeats, so that there is something to find.
-        write_packed(&path, true, chunks, |_, payload, _| {
-            let (first, second) = payload.split_at_mut(payload.len() / 2);
-            second.copy_from_slice(&first[..second.len()]);
-        });
+        write_packed(&path, true, chunks, repeat_beginning);
         let (messages, damage) = read(&path);
-        assert!(damage.is_none(), "{compression_level}: {damage:?}");
+        assert!(damage.is_none(), "{compression:?} {compression_level}: {damage:?}");
+        let library = mcap::Summary::read(&std::fs::read(&path).unwrap()).unwrap().unwrap();
+        let name = serde_json::to_value(compression).unwrap();
+        for chunk in &library.chunk_indexes {
+            let written = if chunk.compression.is_empty() {
+                "none"
+            } else {
+                &chunk.compression
+            };
+            assert_eq!(name, *written);
+        }
         (messages, path.metadata().unwrap().len())
-    });
-    let [(messages, fastest), .., (_, smallest)] = &packed;
-    assert!(packed.iter().all(|(other, _)| other == messages));
-    assert!(fastest > smallest, "{fastest} and {smallest} bytes");
+    };
+    let (whole, largest) = packed(ChunkCompression::None, 0);
+    let levels = [-50, -3, 0, 1, 19].map(|level| packed(ChunkCompression::Zstd, level));
+    assert!(levels.iter().all(|(messages, _)| *messages == whole));
+    let [(_, fastest), .., (_, smallest)] = levels;
+    assert!(
+        largest > fastest && fastest > smallest,
+        "{largest}, {fastest} and {smallest} bytes"
+    );
 }
 
 #[test]
@@ -201,12 +222,19 @@ fn a_recording_that_a_kill_cut_off_lacks_at_most_its_newest_chunk() {
     assert!(RecordingReader::open(&path).unwrap().end().is_none());
 }
 
-/// Forty truncations and forty flipped bits, spread over the whole file, and as many close to its beginning.
+/// For each compression forty truncations and forty flipped bits, spread over the whole file, and as many close to its beginning.
 #[test]
 fn a_damaged_recording_opens_up_to_the_damage_or_is_refused_with_the_place() {
+    for compression in [ChunkCompression::None, ChunkCompression::Zstd] {
+        damage_recording(compression);
+    }
+}
+
+fn damage_recording(compression: ChunkCompression) {
     let directory = tempfile::tempdir().unwrap();
     let path = place(&directory, "whole.mcap");
-    write(&path, true, |_, _, _| {});
+    let chunks = ChunkOptions { compression, ..CHUNKS };
+    write_packed(&path, true, chunks, repeat_beginning);
     let whole = std::fs::read(&path).unwrap();
     let (original, _) = read(&path);
     let damaged = place(&directory, "damaged.mcap");
@@ -232,7 +260,10 @@ fn a_damaged_recording_opens_up_to_the_damage_or_is_refused_with_the_place() {
             for message in recording.messages() {
                 match message {
                     Ok(message) => {
-                        assert_eq!(message, original[read], "byte {at}: a message changed unnoticed");
+                        assert_eq!(
+                            message, original[read],
+                            "{compression:?}, byte {at}: a message changed unnoticed"
+                        );
                         read += 1;
                     }
                     Err(error) => end = Some(error),
@@ -252,9 +283,12 @@ fn a_damaged_recording_opens_up_to_the_damage_or_is_refused_with_the_place() {
             }
         }
     }
-    println!("{opened} opened up to the damage, {refused} refused, {unharmed} unharmed");
+    println!("{compression:?}: {opened} opened up to the damage, {refused} refused, {unharmed} unharmed");
     assert_eq!(opened + refused + unharmed, 80);
-    assert!(opened >= 20 && refused >= 20, "{opened} opened, {refused} refused");
+    assert!(
+        opened >= 20 && refused >= 20,
+        "{compression:?}: {opened} opened, {refused} refused"
+    );
 }
 
 #[test]

@@ -611,6 +611,9 @@ pub struct RecordArgs {
     /// A channel to record (repeatable) [default: those of `record.channels`]
     #[arg(long, value_name = "NAME")]
     pub channel: Vec<String>,
+    /// How chunks are compressed [default: `record.compression` of the run]
+    #[arg(long, value_name = "HOW", value_parser = ["none", "zstd"])]
+    pub compression: Option<String>,
     /// Environment of the run [default: its first]
     #[arg(long, value_name = "N")]
     pub env: Option<u32>,

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{channel::Channel, run::RunFile};
+use ipc_schema::{channel::Channel, config::ChunkCompression, run::RunFile};
 use recorder::{
     diff,
     file::{RECORDING, RecordingError, reader::RecordingReader},
@@ -46,7 +46,13 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
         ));
     }
     let whole_run_dir = run.run_dir.clone();
-    let run = RunFile::read(&run.environment(env).run_dir.join("run.json"))?;
+    let mut run = RunFile::read(&run.environment(env).run_dir.join("run.json"))?;
+    if let Some(compression) = args.compression.as_deref() {
+        run.config.record.compression = match compression {
+            "none" => ChunkCompression::None,
+            _ => ChunkCompression::Zstd,
+        };
+    }
     let channels = chosen_channels(args, &run)?;
     let path = match &args.output {
         Some(path) => path.clone(),

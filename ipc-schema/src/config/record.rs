@@ -12,6 +12,8 @@ pub struct RecordConfig {
     pub manner: RecordManner,
     /// Names of the recorded channels.
     pub channels: Vec<String>,
+    /// How chunks are compressed.
+    pub compression: ChunkCompression,
     /// Level of zstd, which has negative ones too.
     pub compression_level: i32,
     /// Uncompressed size of a chunk, MiB: the most that a kill loses.
@@ -32,6 +34,16 @@ pub enum RecordManner {
     Watching,
     /// `recorder` is a required consumer: its credit bounds the producers, and nothing is missed.
     Lossless,
+}
+
+/// How the chunks of a recording are compressed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ChunkCompression {
+    /// Not at all: half the processor time, and a larger file.
+    None,
+    /// Zstandard.
+    Zstd,
 }
 
 /// What happens while the disk is full.

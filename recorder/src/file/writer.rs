@@ -10,8 +10,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{channel::Channel, config::RecordConfig, digest::ObservationDigest, header::MessageHeader, layout};
-use mcap::{Attachment, WriteOptions, Writer, records::MessageHeader as McapMessageHeader};
+use ipc_schema::{
+    channel::Channel,
+    config::{ChunkCompression, RecordConfig},
+    digest::ObservationDigest,
+    header::MessageHeader,
+    layout,
+};
+use mcap::{Attachment, Compression, WriteOptions, Writer, records::MessageHeader as McapMessageHeader};
 
 use super::{
     CHUNK_TOPIC, END, MESSAGE_ENCODING, PROFILE, RecordingEnd, RecordingError, RecordingStart, SCHEMA_ENCODING, START,
@@ -23,7 +29,7 @@ const CHUNK_WITHIN: Duration = Duration::from_secs(2);
 /// Bytes of a message header.
 const HEADER_BYTES: usize = size_of::<MessageHeader>();
 
-/// Threads that compress while the next messages are taken in: two where enough cores are there for a run beside them. On fewer cores
+/// Threads of zstd that compress while the next messages are taken in: two where enough cores are there for a run beside them. On fewer cores
 /// producers that wait for the recorder get one. A recorder that no process waits for compresses by itself, which costs least.
 fn compression_threads(is_lossless: bool) -> u32 {
     match std::thread::available_parallelism().map_or(1, NonZero::get) {
@@ -114,6 +120,8 @@ impl LineTopic {
 /// How messages are packed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChunkOptions {
+    /// How chunks are compressed.
+    pub compression: ChunkCompression,
     /// Level of zstd. Those below 0 are faster, and 0 is zstd's own default.
     pub compression_level: i32,
     /// Size of a chunk before compression, MiB.
@@ -123,6 +131,7 @@ pub struct ChunkOptions {
 impl From<&RecordConfig> for ChunkOptions {
     fn from(record: &RecordConfig) -> Self {
         Self {
+            compression: record.compression,
             compression_level: record.compression_level,
             chunk_mib: record.chunk_mib,
         }
@@ -195,6 +204,10 @@ impl RecordingWriter {
         let options = WriteOptions::new()
             .profile(PROFILE)
             .library(concat!("caraware ", env!("CARGO_PKG_VERSION")))
+            .compression(match chunks.compression {
+                ChunkCompression::None => None,
+                ChunkCompression::Zstd => Some(Compression::Zstd),
+            })
             // The library passes the level on as a signed number.
             .compression_level(chunks.compression_level.cast_unsigned())
             .compression_threads(compression_threads(start.is_lossless))

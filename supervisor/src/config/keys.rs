@@ -540,6 +540,7 @@ pub const KEYS: &[ConfigKey] = &[
     float("fanout.status_hz", "1/s", 0.0, 1000.0, "Limit of status reports per wall second; 0 = none."),
     other("record.manner", ValueKind::Choice(&["off", "watching", "lossless"]), "Record the run into a file (docs/recording.md): \"watching\", no process waits for `recorder`, and what it misses is counted; \"lossless\", the run waits for it, and nothing is missed."),
     other("record.channels", ValueKind::Texts, "Recorded channels, by their names (ipc-schema/src/lib.rs). A channel that the run does not use adds nothing."),
+    other("record.compression", ValueKind::Choice(&["none", "zstd"]), "How chunks are compressed. \"none\" takes about half the processor time of \"zstd\", and the file is as large as the messages are."),
     integer("record.compression_level", "", -50, 19, "Level of zstd: higher is smaller and slower; 0 is zstd's own default."),
     integer("record.chunk_mib", "MiB", 1, 64, "Size of a chunk before compression. A kill loses at most the newest chunk."),
     other("record.on_full_disk", ValueKind::Choice(&["wait", "stop_recording", "end_run"]), "On a full disk `recorder` waits for space, and with \"lossless\" the run with it (\"wait\"); the recording ends and the run continues (\"stop_recording\"); or the run ends (\"end_run\")."),
