@@ -291,7 +291,10 @@ def test_each_rank_gets_its_own_environments_and_cores() -> None:
     assert words[words.index("--name") + 1] == "x-rank1"
     for setting in ("run.envs=3", "run.first_env=3", "trainer.ranks=2", "fanout.enabled=false"):
         assert f"--set={setting}" in words
+    assert words.count("--quiet") == 1
+    assert command(["--quiet"], place, Launch(7, 0.0), disagree).count("--quiet") == 1
     first = command([], RankPlace(0, 2, 0, 2), Launch(7, 0.0), disagree)
+    assert "--quiet" not in first
     assert first[first.index("--name") + 1] == "town-p7"
     assert not any("fanout" in word for word in first)
     assert place.cores([0, 1, 2, 3, 8]) == [2, 3]

@@ -128,7 +128,7 @@ def command(arguments: Sequence[str], place: RankPlace, launch: Launch, agree: A
         raise ResumeError("--restart is for a trainer alone: `torchrun --max-restarts K …` continues ranks by itself")
     runs, config = known.runs or Path("runs"), others[0] if others and not others[0].startswith("-") else "town"
     others = [*others, "--runs", str(runs)]
-    if place.rank > 0:
+    if place.rank > 0 and "--quiet" not in others:
         # One run can be watched; the others show nothing and say only what went wrong.
         others = [*others, "--quiet"]
     if known.resume:
