@@ -1,6 +1,6 @@
 //! The errors of a configuration, each with the place where it was made and the fix.
 
-use miette::{Diagnostic, LabeledSpan, NamedSource, Severity, SourceCode};
+use miette::{Diagnostic, LabeledSpan, Severity, SourceCode};
 
 use super::{
     keys::{self, ConfigKey},
@@ -132,12 +132,11 @@ impl Diagnostic for ConfigError {
     }
 
     fn source_code(&self) -> Option<&dyn SourceCode> {
-        self.place()
-            .map(|place| place.source.as_ref() as &NamedSource<String> as &dyn SourceCode)
+        self.place().map(|place| place as &dyn SourceCode)
     }
 
     fn labels(&self) -> Option<Box<dyn Iterator<Item = LabeledSpan> + '_>> {
         let place = self.place()?;
-        Some(Box::new(std::iter::once(LabeledSpan::underline(place.span.clone()))))
+        Some(Box::new(std::iter::once(LabeledSpan::underline(place.label()))))
     }
 }

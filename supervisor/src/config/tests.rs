@@ -17,6 +17,31 @@ fn error_of(text: &str) -> (String, String) {
     (error.to_string(), help)
 }
 
+/// A line of 100 000 letters is not printed: what is around the part that is wrong says as much.
+#[test]
+fn the_error_in_a_long_line_shows_what_is_around_its_part() {
+    let long = "é".repeat(50_000);
+    for (text, part) in [
+        (
+            format!("curriculum.log = \"{long}\"\ntraffic.cavs = -1\n"),
+            "traffic.cavs = -1",
+        ),
+        (format!("map.place = {{ a = \"{long}\", b = 1 }}\n"), "map.place"),
+        (
+            format!("fanout = {{ users = \"{long}\", world_hz = -1 }}\n"),
+            "world_hz = -1",
+        ),
+        (format!("traffic.cavs = \"{long}\"\n"), "traffic.cavs"),
+    ] {
+        let error = config_of(&text).unwrap_err();
+        let mut shown = String::new();
+        let handler = miette::GraphicalReportHandler::new_themed(miette::GraphicalTheme::unicode_nocolor());
+        handler.with_width(100).render_report(&mut shown, &error).unwrap();
+        assert!(shown.contains(part), "{shown}");
+        assert!(shown.len() < 3000, "{} bytes for {part}", shown.len());
+    }
+}
+
 #[test]
 fn the_default_preset_is_valid_and_complete() {
     let config = LayeredSettings::defaults().unwrap().validate().unwrap();
