@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from caraware.tasks import driving
-from caraware.tasks.driving import DrivenStep, careful_reward, progress_reward, yielding_reward
+from caraware.tasks.driving import DrivenStep, careful_reward, gap_reward, progress_reward, yielding_reward
 from caraware.tasks.fields import Fields
 from caraware.tasks.foresight import HERO_M, HERO_MIDDLE_M, HERO_WIDTH_M, HORIZON_S, PERSONS, TIMES, USERS, Around
 from numpy.typing import NDArray
@@ -185,3 +185,69 @@ def test_without_junctions_and_lights_in_the_row_nothing_is_known_of_them() -> N
     assert step.seen("light_1_gap", 7.0).tolist() == [7.0]
     assert replace(step, around=None).seen("user_1_x", 7.0).tolist() == [7.0]
     assert yielding_reward(step).item() == progress_reward(step).item()
+
+
+ENCOUNTER = {"reaches": (0.0, 10.0), "enters": (0.0, 10.0), "leaves": (0.0, 10.0), "way": (0.0, 50.0)}
+NO_ENCOUNTER = (10.0, 10.0, 10.0, 50.0)
+
+
+def crossing(
+    *encounters: tuple[float, float, float, float],
+    speed: float,
+    other: float = 10.0,
+    gap: float = 5.0,
+    right: float = 0.0,
+) -> DrivenStep:
+    """A hero at `speed`, `gap` before a junction, with vehicles at `other` whose ways cross its own."""
+    met = [*encounters, *[NO_ENCOUNTER] * (USERS - len(encounters))]
+    columns = {**RANGES, **ENCOUNTER}
+    user = (50.0, 50.0, 0.0, 0.0, 0.0, other, 0.0, 0.0)
+    ranges = {f"user_{n}_{name}": span for n in range(1, USERS + 1) for name, span in columns.items()}
+    ranges |= {name: JUNCTION[name] for name in ("junction_1_gap", "junction_1_priority")}
+    values = [value for encounter in met for value in (*user, *encounter)] + [gap, right]
+    unit = [(value - low) / (high - low) for value, (low, high) in zip(values, ranges.values(), strict=True)]
+    pace = torch.tensor([speed], dtype=torch.float64)
+    seen = Around(Fields(tuple(ranges), 1, 0.0, ranges), torch.tensor([unit]), pace, torch.zeros_like(pace))
+    return replace(driven(), speed_mps=pace, around=seen)
+
+
+@pytest.mark.parametrize(
+    ("encounter", "speed", "other", "short"),
+    [
+        # There after 2 s, and 6.5 m further 0.8125 s later. The other comes 0.1875 s after that.
+        ((2.0, 3.0, 4.0, 16.0), 8.0, 10.0, (1 - 0.1875 / 1.2) * 0.5),
+        # The other has left it a second before.
+        ((2.0, 0.5, 1.0, 16.0), 8.0, 10.0, (1 - 1 / 1.2) * 0.5),
+        ((2.0, 2.0, 4.0, 16.0), 8.0, 10.0, 0.5),
+        ((2.0, 4.1, 5.0, 16.0), 8.0, 10.0, 0.0),
+        ((2.0, 0.3, 0.7, 16.0), 8.0, 10.0, 0.0),
+        ((4.0, 4.0, 5.0, 32.0), 8.0, 10.0, 0.0),
+        # The hero that stands would be there after 2 s, and the slow one, 9 m away, after 2.86 s.
+        ((10.0, 9.0, 10.0, 4.0), 0.0, 1.0, 0.5),
+        ((10.0, 9.0, 10.0, 4.0), 0.0, 0.2, 0.0),
+        # It stands on the hero's way already, and there is none.
+        ((2.0, 0.1, 9.0, 16.0), 8.0, 10.0, 0.0),
+        (NO_ENCOUNTER, 8.0, 10.0, 0.0),
+    ],
+)
+def test_a_gap_is_short_by_hand(
+    encounter: tuple[float, float, float, float], speed: float, other: float, short: float
+) -> None:
+    for before in range(0, USERS, 3):
+        step = crossing(*[NO_ENCOUNTER] * before, encounter, speed=speed, other=other)
+        assert step.short_gap.item() == pytest.approx(short, abs=2e-6)
+
+
+def test_a_hero_without_right_of_way_pays_for_a_short_gap_as_it_moves() -> None:
+    def cost(speed: float, gap: float = 5.0, right: float = 0.0) -> float:
+        step = crossing((2.0, 3.0, 4.0, 16.0), speed=speed, gap=gap, right=right)
+        return (yielding_reward(step) - gap_reward(step)).item()
+
+    assert cost(8.0) == pytest.approx(driving.GAP_COST * (1 - 0.1875 / 1.2) * 0.5, rel=1e-4)
+    assert cost(0.0) == cost(8.0, right=1.0) == cost(8.0, gap=30.0) == 0.0
+    yes = torch.ones(1, dtype=torch.bool)
+    ended = replace(crossing((2.0, 3.0, 4.0, 16.0), speed=8.0), ended=yes, failed=yes)
+    assert gap_reward(ended).item() == -driving.YIELDING_END_COST
+    blind = replace(driven(), around=around(speed=10.0))
+    assert blind.short_gap.item() == replace(driven(), around=None).short_gap.item() == 0.0
+    assert gap_reward(blind).item() == yielding_reward(blind).item()

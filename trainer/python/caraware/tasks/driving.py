@@ -44,6 +44,8 @@ PRIORITY_SHARE, PRIORITY_WITHIN_M = 0.7, 10.0
 """Of that cost for a hero with right of way at a junction that is this near."""
 RED_COST, RED_BRAKING_MPS2, RED_HARDEST_MPS2 = 0.3, 3.0, 7.0
 """Of a tick before a red light that only the last braking still stops at; none at the first."""
+GAP_COST, GAP_WITHIN_M = 0.5, 25.0
+"""Of a tick in which a hero without right of way comes to an encounter at a junction that is this near."""
 RED_GREEN = 0.02
 """A light below this is red: yellow ends at 0.05."""
 
@@ -105,6 +107,11 @@ class DrivenStep:
         """
         return torch.full_like(self.progress_m, torch.inf) if self.around is None else self.around.contact_s()
 
+    @cached_property
+    def short_gap(self) -> Tensor:
+        """0 to 1: how much too short the gap is in which the hero meets others; see `Around.short_gap`."""
+        return torch.zeros_like(self.progress_m) if self.around is None else self.around.short_gap()
+
     def seen(self, field: str, without: float) -> Tensor:
         """f64 `[n]`: a field of the observation after the tick in SI units, or `without` where it lacks the field."""
         if self.around is None or not self.around.fields.has(field):
@@ -162,6 +169,16 @@ def yielding_reward(step: DrivenStep) -> Tensor:
     cost = cost + RED_COST * late * (step.seen("light_1_green", 1.0) < RED_GREEN)
     cost = cost + WAITING_COST * (step.speed_mps < WAITS_MPS)
     return torch.where(step.ended & step.failed, -YIELDING_END_COST, progress_reward(step) - cost * ~step.ended)
+
+
+def gap_reward(step: DrivenStep) -> Tensor:
+    """`yielding_reward`, less a cost of coming to a junction without right of way while the gap is too short.
+
+    `DrivenStep.contact_s` looks straight ahead: this cost follows the ways of both through the junction.
+    """
+    yields = (step.seen("junction_1_priority", 1.0) < 0.5) & (step.seen("junction_1_gap", torch.inf) < GAP_WITHIN_M)
+    cost = GAP_COST * step.short_gap * (step.speed_mps / 3).clamp(0, 1) * yields
+    return yielding_reward(step) - cost * ~step.ended
 
 
 @dataclass(frozen=True)

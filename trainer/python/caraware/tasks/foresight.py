@@ -24,6 +24,16 @@ STRAIGHT_RADPS = 1e-3
 PERSON_M = 0.5
 """Room of a person to each side, metres."""
 USERS, PERSONS = 8, 2
+GAP_S, NEAR_S = 1.2, 4.0
+"""Of a gap that is long enough, and how far ahead encounters are looked at."""
+STARTS_MPS, STARTS_MPS2 = 4.0, 2.0
+"""A hero below this speed is taken to accelerate by this."""
+OTHER_STARTS_MPS, OTHER_STARTS_MPS2, STANDS_MPS = 5.0, 1.5, 0.3
+"""The same of others that move at all."""
+CLEARS_M, CLEARS_MPS = 6.5, 3.0
+"""A hero leaves the way of another this far on, and at least at this speed."""
+NEVER_S, ON_THE_WAY_S, NOWHERE_M = 9.9, 0.2, 49.0
+"""What `user_N_enters` and `user_N_way` say of no encounter, and of one whose place the other has reached."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,27 @@ class Around:
     def contact_s(self) -> Tensor:
         """f64 `[n]`: seconds until the first contact; infinite beyond `HORIZON_S`, and for what rows do not show."""
         return torch.minimum(self._vehicle_s(), self._person_s())
+
+    def short_gap(self) -> Tensor:
+        """f64 `[n]`, 0 to 1: how much too short the gap is in which the hero meets others, and how near that is.
+
+        1: both are there now, at the same time. 0: the one has left the place `GAP_S` before the other comes, or the
+        hero comes there in `NEAR_S` or later, or rows do not show it. What stands on the hero's way is no encounter.
+        """
+        users = self._members("user", USERS, ("reaches", "enters", "leaves", "way", "forward", "left"))
+        if users is None:
+            return torch.zeros_like(self.speed_mps)
+        reaches, enters, leaves, way, forward, left = users.double().unbind(2)
+        speed, other = self.speed_mps[:, None], torch.hypot(forward, left)
+        starts = (-speed + (speed.square() + 2 * STARTS_MPS2 * way).sqrt()) / STARTS_MPS2
+        reaches = torch.where(speed < STARTS_MPS, torch.minimum(reaches, starts), reaches)
+        clears = reaches + CLEARS_M / speed.clamp_min(CLEARS_MPS)
+        sooner = (-other + (other.square() + 2 * OTHER_STARTS_MPS2 * enters * other).sqrt()) / OTHER_STARTS_MPS2
+        comes = torch.where((other > STANDS_MPS) & (other < OTHER_STARTS_MPS), sooner, enters)
+        gap = torch.maximum(comes - clears, reaches - leaves).clamp_min(0)
+        meets = (way < NOWHERE_M) & (enters > ON_THE_WAY_S) & (enters < NEVER_S)
+        short = (1 - gap / GAP_S).clamp_min(0) * (1 - reaches / NEAR_S).clamp_min(0)
+        return (short * meets).amax(1)
 
     def _members(self, group: str, members: int, columns: tuple[str, ...]) -> Tensor | None:
         """f32 `[n, members, columns]` in SI units, or None without them."""
