@@ -12,7 +12,8 @@ pub struct RecordConfig {
     pub manner: RecordManner,
     /// Names of the recorded channels.
     pub channels: Vec<String>,
-    /// How chunks are compressed.
+    /// How chunks are compressed. Runs and recordings of earlier programs do not say it.
+    #[serde(default)]
     pub compression: ChunkCompression,
     /// Level of zstd, which has negative ones too.
     pub compression_level: i32,
@@ -37,12 +38,13 @@ pub enum RecordManner {
 }
 
 /// How the chunks of a recording are compressed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ChunkCompression {
     /// Not at all: half the processor time, and a larger file.
     None,
     /// Zstandard.
+    #[default]
     Zstd,
 }
 
@@ -94,5 +96,21 @@ impl RecordConfig {
             .into_iter()
             .filter(|other| other.spec().paced_by == channel);
         paced.any(|other| self.is_lossless(other))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::ChunkCompression;
+    use crate::config::Config;
+
+    #[test]
+    fn what_an_earlier_program_wrote_is_compressed_by_zstd() {
+        let town = include_str!("../../tests/town.json");
+        let earlier = town.replace("    \"compression\": \"zstd\",\n", "");
+        assert_ne!(earlier, town);
+        let record = Config::from_json(&earlier).unwrap().record;
+        assert_eq!(record.compression, ChunkCompression::Zstd);
     }
 }
