@@ -83,7 +83,7 @@ const QUICK: WatchSize = WatchSize {
 enum RecorderPlace {
     /// Beside the run.
     Here,
-    /// Beside the run, and compresses nothing.
+    /// Beside the run, with `--compression none`.
     Uncompressed,
     /// Beside the third run.
     Elsewhere,
@@ -207,9 +207,9 @@ fn report(
              Stretches of {} ticks are compared with the same ticks of the other run, without the first {}, in which a recorder comes or goes. \
              A pair of stretches has `caraware record` for the one run and then for the other, and a ratio is the geometric mean of both. In \
              {} pairs it is beside that run, and in {} pairs with `--compression none`; in {} pairs it is beside the third run, which costs \
-             what any such program costs; and {} pairs have none. Intervals are those of the median, 95 % at least, from the order of the ratios alone. Processor time is that of \
-             `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorders received {message_mb_per_s:.0} MB/s and missed {:.0} ticks. At \
-             the end one run was {} ticks ahead, and the load of the machine was {load}.",
+             what any such program costs; and {} pairs have none. Intervals are those of the median, 95 % at least, from the order of the \
+             ratios alone. Processor time is that of `traffic-bridge`, `sim-core` and `sensor-daemon`. The recorders received \
+             {message_mb_per_s:.0} MB/s and missed {:.0} ticks. At the end one run was {} ticks ahead, and the load of the machine was {load}.",
             size.vehicles,
             size.stretch,
             size.settling,

@@ -6,7 +6,15 @@ use clap::{
     Args, Parser, Subcommand, ValueEnum,
     builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
 };
-use ipc_schema::sensor::SensorSelection;
+use ipc_schema::{config::ChunkCompression, sensor::SensorSelection};
+
+use serde::{
+    Deserialize,
+    de::{
+        IntoDeserializer,
+        value::{Error as ValueError, StrDeserializer},
+    },
+};
 
 use crate::{failure::Exit, import::BoundingBox, scenario_settings};
 
@@ -529,6 +537,14 @@ pub struct MetricsArgs {
     pub prometheus: Option<String>,
 }
 
+/// How a recording is compressed, by the names of `record.compression`.
+fn compression() -> impl TypedValueParser<Value = ChunkCompression> {
+    PossibleValuesParser::new(["none", "zstd"]).try_map(|name| {
+        let name: StrDeserializer<'_, ValueError> = name.as_str().into_deserializer();
+        ChunkCompression::deserialize(name)
+    })
+}
+
 /// Parses a time between two measurements.
 fn interval(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
@@ -612,8 +628,8 @@ pub struct RecordArgs {
     #[arg(long, value_name = "NAME")]
     pub channel: Vec<String>,
     /// How chunks are compressed [default: `record.compression` of the run]
-    #[arg(long, value_name = "HOW", value_parser = ["none", "zstd"])]
-    pub compression: Option<String>,
+    #[arg(long, value_name = "HOW", value_parser = compression())]
+    pub compression: Option<ChunkCompression>,
     /// Environment of the run [default: its first]
     #[arg(long, value_name = "N")]
     pub env: Option<u32>,

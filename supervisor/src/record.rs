@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{channel::Channel, config::ChunkCompression, run::RunFile};
+use ipc_schema::{channel::Channel, run::RunFile};
 use recorder::{
     diff,
     file::{RECORDING, RecordingError, reader::RecordingReader},
@@ -47,12 +47,7 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
     }
     let whole_run_dir = run.run_dir.clone();
     let mut run = RunFile::read(&run.environment(env).run_dir.join("run.json"))?;
-    if let Some(compression) = args.compression.as_deref() {
-        run.config.record.compression = match compression {
-            "none" => ChunkCompression::None,
-            _ => ChunkCompression::Zstd,
-        };
-    }
+    run.config.record.compression = args.compression.unwrap_or(run.config.record.compression);
     let channels = chosen_channels(args, &run)?;
     let path = match &args.output {
         Some(path) => path.clone(),

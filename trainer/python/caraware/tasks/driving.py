@@ -45,7 +45,7 @@ PRIORITY_SHARE, PRIORITY_WITHIN_M = 0.7, 10.0
 RED_COST, RED_BRAKING_MPS2, RED_HARDEST_MPS2 = 0.3, 3.0, 7.0
 """Of a tick before a red light that only the last braking still stops at; none at the first."""
 GAP_COST, GAP_WITHIN_M = 0.5, 25.0
-"""Of a tick in which a hero without right of way comes to an encounter at a junction that is this near."""
+"""At most, of a tick in which a hero that has to wait comes to an encounter; at a junction that is this near."""
 RED_GREEN = 0.02
 """A light below this is red: yellow ends at 0.05."""
 

@@ -25,15 +25,16 @@ PERSON_M = 0.5
 """Room of a person to each side, metres."""
 USERS, PERSONS = 8, 2
 GAP_S, NEAR_S = 1.2, 4.0
-"""Of a gap that is long enough, and how far ahead encounters are looked at."""
+"""A gap from here on is long enough, and an encounter from here on is too far ahead to count."""
 STARTS_MPS, STARTS_MPS2 = 4.0, 2.0
-"""A hero below this speed is taken to accelerate by this."""
+"""Below this speed a hero counts as one that accelerates by this."""
 OTHER_STARTS_MPS, OTHER_STARTS_MPS2, STANDS_MPS = 5.0, 1.5, 0.3
-"""The same of others that move at all."""
+"""The same of others, unless they are slower than the last: those stand."""
 CLEARS_M, CLEARS_MPS = 6.5, 3.0
-"""A hero leaves the way of another this far on, and at least at this speed."""
+"""A hero has left the way of another this far on, and gets there at this speed at least."""
 NEVER_S, ON_THE_WAY_S, NOWHERE_M = 9.9, 0.2, 49.0
-"""What `user_N_enters` and `user_N_way` say of no encounter, and of one whose place the other has reached."""
+"""Of `user_N_enters`: from the first on there is no encounter, below the second the other is at its place already; and
+from the third on, of `user_N_way`, there is none."""
 
 
 @dataclass(frozen=True)
