@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caraware.ipc.arrays import Float32Array, Float64Array
@@ -64,6 +66,14 @@ class Fields:
         low, high = self._range(name)
         unit = (observation[..., self._place(name)].double() - self.low) / (1.0 - self.low)
         return low + unit * (high - low)
+
+    def si_columns(self, observation: Tensor, names: Sequence[str]) -> Tensor:
+        """Several fields of a tensor at once, f64 `[..., names]`."""
+        places = [self._place(name) for name in names]
+        low, high = torch.tensor([self._range(name) for name in names], dtype=torch.float64).T.to(observation.device)
+        unit = (observation[..., places].double() - self.low) / (1.0 - self.low)
+        values: Tensor = low + unit * (high - low)
+        return values
 
     def range(self, name: str) -> tuple[float, float]:
         """Lower and upper end of field `name` in SI units. Raises `UnknownFieldError`."""
