@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from caraware.driving.dagger import BATCH, MixedDrivers, Pupil, Rows, Teacher, varied
+from caraware.driving.dagger import BATCH, CorrectedPolicy, MixedDrivers, Pupil, SeenRows, varied
 from caraware.driving.right_of_way import RightOfWay, arrives_s
 from caraware.learn.encoders import FIELDS, GroupedNetwork
 from caraware.tasks.fields import Fields, UnknownFieldError
@@ -110,7 +110,7 @@ def test_other_observations_are_refused_by_name() -> None:
 
 
 def test_a_full_store_keeps_a_fair_sample() -> None:
-    rows = Rows(200, torch.Generator().manual_seed(3))
+    rows = SeenRows(200, torch.Generator().manual_seed(3))
     for first in range(0, 2000, 40):
         rows.add(torch.arange(first, first + 40).unsqueeze(1).float().repeat(1, 2))
     kept = rows.drawn(20_000)[:, 0]
@@ -123,9 +123,9 @@ def test_a_full_store_keeps_a_fair_sample() -> None:
 def test_a_pupil_learns_to_give_way_and_forgets_nothing() -> None:
     torch.manual_seed(5)
     network = GroupedNetwork(FIELDS, 2, (32, 32))
-    teacher = Teacher(copy.deepcopy(network), RightOfWay(fields(), MAX_DECEL))
+    teacher = CorrectedPolicy(copy.deepcopy(network), RightOfWay(fields(), MAX_DECEL))
     generator = torch.Generator().manual_seed(6)
-    rows, pupil = Rows(5000, generator), Pupil(network, teacher, generator)
+    rows, pupil = SeenRows(5000, generator), Pupil(network, teacher, generator)
     scenes = [row(8, gap, 0, crossing(gap + 4, 2, 3)) for gap in range(8, 24, 2)] + [row(8, 12, 1), row(8, 40, 0)]
     rows.add(torch.cat(scenes * 50))
     before = pupil.errors(rows)

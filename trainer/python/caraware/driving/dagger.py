@@ -10,6 +10,7 @@ Gordon and Bagnell, arXiv 1011.0686.
 import copy
 import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import ConfigError, config_table
 from caraware.learn.adam import ModuleAdam
 from caraware.learn.build import build_ppo, configure_torch
-from caraware.learn.config import TrainerConfig
+from caraware.learn.config import TrainerConfig, TrainerDevice
 from caraware.learn.encoders import EGO, FIELDS, GROUPS
 from caraware.learn.ppo import PlainUpdate
 from caraware.run.learner import begin_from
@@ -51,7 +52,7 @@ CORRECTED_WEIGHT, CORRECTED_FROM = 3.0, 0.02
 """Rows in which the rule changed the action by more than this count so many times."""
 
 
-class Rows:
+class SeenRows:
     """What heroes saw: a fair sample of all rows that were offered."""
 
     def __init__(self, capacity: int, generator: torch.Generator) -> None:
@@ -79,7 +80,7 @@ class Rows:
         return self._seen[torch.randint(len(self), (count,), generator=self._generator)].float()
 
 
-class Teacher:
+class CorrectedPolicy:
     """The policy of the beginning, corrected by the rule. It has an answer for any row, also for one never seen."""
 
     def __init__(self, network: nn.Module, rule: RightOfWay) -> None:
@@ -93,7 +94,7 @@ class Teacher:
         return wanted, (wanted - own).abs().amax(1) > CORRECTED_FROM
 
 
-def varied(rows: Rows, count: int, generator: torch.Generator) -> Tensor:
+def varied(rows: SeenRows, count: int, generator: torch.Generator) -> Tensor:
     """Rows f32 `[count, d]`: as they were seen, with noise, with another hero's own fields, and of mixed groups.
 
     A pupil that is taught the rows alone forgets on other maps what it could: there it drove against the traffic.
@@ -116,12 +117,12 @@ def varied(rows: Rows, count: int, generator: torch.Generator) -> Tensor:
 class Pupil:
     """The policy that learns, by regression."""
 
-    def __init__(self, network: nn.Module, teacher: Teacher, generator: torch.Generator) -> None:
+    def __init__(self, network: nn.Module, teacher: CorrectedPolicy, generator: torch.Generator) -> None:
         self.network, self._teacher, self._generator = network, teacher, generator
         self._optimiser = ModuleAdam(network.parameters())
         self._unit = torch.tensor(UNIT)
 
-    def learn(self, rows: Rows, learning_rate: float) -> None:
+    def learn(self, rows: SeenRows, learning_rate: float) -> None:
         """One step on rows drawn at random and varied: Huber's loss of the error in units."""
         seen = varied(rows, BATCH, self._generator)
         actions, corrected = self._teacher.actions(seen)
@@ -132,7 +133,7 @@ class Pupil:
         ((loss * weights).sum() / weights.sum()).backward()
         self._optimiser.step(learning_rate)
 
-    def errors(self, rows: Rows) -> dict[str, list[float]]:
+    def errors(self, rows: SeenRows) -> dict[str, list[float]]:
         """Mean absolute errors of steering and acceleration over rows as seen: of corrected ones, and of all others."""
         with torch.no_grad():
             seen = rows.drawn(20_000)
@@ -166,7 +167,8 @@ class MixedDrivers:
 def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
     """Drive and learn until the run ends or stops; write the pupil and the report's part."""
     run = read_run(run_file)
-    task, config = task_of_run(run), TrainerConfig.from_run(run)
+    # The heroes' few rows and the batches are on the CPU.
+    task, config = task_of_run(run), replace(TrainerConfig.from_run(run), device=TrainerDevice.CPU)
     begin = str(config_table(run, "task").get("begin_from", ""))
     if not isinstance(task, Driving) or not begin:
         raise ConfigError("there is no policy to correct", 'set task.kind = "driving" and task.begin_from')
@@ -180,8 +182,8 @@ def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         raise ConfigError("the rule needs the preset's fields", 'set observation.fields = "driver", without a history')
     begin_from(ppo.updater.parameters(), Path(begin))
     generator = torch.Generator().manual_seed(config.seed)
-    network, rows = ppo.updater.policy.network, Rows(CAPACITY, generator)
-    teacher = Teacher(copy.deepcopy(network), RightOfWay.from_run(run))
+    network, rows = ppo.updater.policy.network, SeenRows(CAPACITY, generator)
+    teacher = CorrectedPolicy(copy.deepcopy(network), RightOfWay.from_run(run))
     pupil, drivers = Pupil(network, teacher, generator), MixedDrivers(config.seed)
     channel, ended, lessons = Channel(str(run_file)), False, 0
 
@@ -204,8 +206,8 @@ def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
             channel.publish_actions(obs, torch.where(valid, answer(obs), 0.0).numpy())
             channel.consumed(obs.tick)
             ended = obs.last
-    # Half as many lessons again, with a falling learning rate.
-    for lesson in range(lessons // 2):
+    # Half as many lessons again, with a falling learning rate, unless the run was asked to stop.
+    for lesson in range(0 if stop.requested else lessons // 2):
         pupil.learn(rows, LEARNING_RATE * (1 - 2 * lesson / lessons))
     # Without the standard deviation, which no teacher shows: `trainer.initial_std` holds for the learner, too.
     taught = {n: t.clone() for n, t in ppo.updater.parameters().items() if n.startswith("policy.")}
