@@ -203,12 +203,16 @@ fn report(
     load: &str,
     is_pinned: bool,
 ) -> Result<BenchReport, Exit> {
+    let pace = match size.real_time_factor {
+        0 => "at full speed".to_owned(),
+        factor => format!("at {factor} × real time"),
+    };
     let message_mb_per_s = received.message_mb / received.wall_s.max(1e-9);
     let mut report = BenchReport::new(
         "watch",
         "A recorder that watches",
         format!(
-            "{} vehicles on a generated city, `caraware simulate` at full speed without viewers, two equal runs and a third side by side. \
+            "{} vehicles on a generated city, `caraware simulate` {pace} without viewers, two equal runs and a third side by side. \
              Stretches of {} ticks are compared with the same ticks of the other run, without the first {}, in which a recorder comes or goes. \
              A pair of stretches has `caraware record` for the one run and then for the other, and a ratio is the geometric mean of both. In \
              {} pairs it is beside that run, and in {} pairs with `--compression none`; in {} pairs it is beside the third run, which costs \
