@@ -1,6 +1,7 @@
 """The rule that corrects a driver: junctions by hand, and a pupil that is taught it."""
 
 import copy
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -8,31 +9,18 @@ from caraware.driving.dagger import BATCH, CorrectedPolicy, MixedDrivers, Pupil,
 from caraware.driving.right_of_way import RightOfWay, arrives_s
 from caraware.learn.encoders import FIELDS, GroupedNetwork
 from caraware.tasks.fields import Fields, UnknownFieldError
+from test_foresight import ENCOUNTER, RANGES
 from torch import Tensor
 
 MAX_DECEL = 9.0
-USER = {
-    "x": (-50.0, 50.0),
-    "y": (-50.0, 50.0),
-    "cos": (-1.0, 1.0),
-    "sin": (-1.0, 1.0),
-    "forward": (-30.0, 30.0),
-    "left": (-30.0, 30.0),
-    "length": (0.0, 20.0),
-    "width": (0.0, 3.0),
-    "way": (0.0, 50.0),
-    "reaches": (0.0, 10.0),
-    "enters": (0.0, 10.0),
-    "leaves": (0.0, 10.0),
-    "turn": (-1.0, 1.0),
-}
+USER = {**RANGES, **ENCOUNTER, "turn": (-1.0, 1.0)}
 NO_USER = {"x": 50.0, "y": 50.0, "way": 50.0, "reaches": 10.0, "enters": 10.0, "leaves": 10.0}
 JUNCTION = {"gap": (0.0, 100.0), "priority": (0.0, 1.0), "rival": (0.0, 10.0)}
 OWN = ("speed", *(f"own_{number}" for number in range(15)))
 
 
 def fields() -> Fields:
-    """Those of the preset "driver", in its order, as far as the rule reads them; the others have its places."""
+    """As many as the preset "driver" has; those that the rule reads have its names."""
     ranges = {name: (0.0, 30.0) if name == "speed" else (-1.0, 1.0) for name in OWN}
     ranges |= {f"user_{n}_{name}": span for n in range(1, 9) for name, span in USER.items()}
     ranges |= {f"junction_{n}_{name}": span for n in range(1, 4) for name, span in JUNCTION.items()}
@@ -69,7 +57,7 @@ def most(seen: Tensor, wants: float = 0.5) -> float:
 @pytest.mark.parametrize(
     ("what", "seen", "expected"),
     [
-        ("nobody is there", row(8, 12, 0), 0.5),
+        ("no vehicle is there", row(8, 12, 0), 0.5),
         ("it stops at the line: 64 / 2 / 11.3 m, and a tenth", row(8, 12, 0, crossing(16, 2, 3)), -2.83 * 1.1 / 9),
         ("it has right of way, and the other can stop", row(8, 12, 1, crossing(16, 2, 3)), 0.5),
         ("the other has passed before", row(8, 12, 0, crossing(16, 0.5, 1.0)), 0.5),
@@ -109,6 +97,12 @@ def test_other_observations_are_refused_by_name() -> None:
         RightOfWay(less, MAX_DECEL).corrected(row(8, 12, 0)[:, :60], torch.zeros(1, 2))
 
 
+def test_columns_are_the_fields_one_by_one() -> None:
+    known, seen = fields(), row(8, 12, 0, crossing(16, 2, 3))
+    one_by_one = torch.stack([known.si_tensor(seen, name) for name in known.names], 1)
+    assert torch.equal(known.si_columns(seen, known.names), one_by_one)
+
+
 def test_a_full_store_keeps_a_fair_sample() -> None:
     rows = SeenRows(200, torch.Generator().manual_seed(3))
     for first in range(0, 2000, 40):
@@ -120,7 +114,17 @@ def test_a_full_store_keeps_a_fair_sample() -> None:
     assert all(((kept >= first) & (kept < first + 400)).any() for first in range(0, 2000, 400))
 
 
-def test_a_pupil_learns_to_give_way_and_forgets_nothing() -> None:
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Threads of small steps wait for each other where other work has the cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_pupil_learns_to_give_way_and_keeps_what_it_could() -> None:
     torch.manual_seed(5)
     network = GroupedNetwork(FIELDS, 2, (32, 32))
     teacher = CorrectedPolicy(copy.deepcopy(network), RightOfWay(fields(), MAX_DECEL))
@@ -129,11 +133,12 @@ def test_a_pupil_learns_to_give_way_and_forgets_nothing() -> None:
     scenes = [row(8, gap, 0, crossing(gap + 4, 2, 3)) for gap in range(8, 24, 2)] + [row(8, 12, 1), row(8, 40, 0)]
     rows.add(torch.cat(scenes * 50))
     before = pupil.errors(rows)
-    for _ in range(60):
+    for _ in range(120):
         pupil.learn(rows, 2e-3)
     after = pupil.errors(rows)
     assert after["corrected_error"][1] < 0.35 * before["corrected_error"][1]
-    assert before["other_error"] == [0.0, 0.0] and after["other_error"][0] < 0.02
+    assert before["other_error"] == [0.0, 0.0]
+    assert after["other_error"][0] < 0.02 and after["other_error"][1] < 0.3 * before["corrected_error"][1]
     assert float(varied(rows, BATCH, generator).abs().max()) <= 1.0
 
 

@@ -144,7 +144,7 @@ class Pupil:
 
 
 class MixedDrivers:
-    """Who drives: for some heroes the teacher, and noise for all, so that the pupil sees how to get back."""
+    """The teacher drives some heroes, the pupil the others, all with noise: so the pupil sees how to get back."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)

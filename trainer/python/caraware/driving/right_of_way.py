@@ -12,8 +12,8 @@ from torch import Tensor
 
 from caraware.ipc.run_file import RunFile, setting
 from caraware.tasks.fields import Fields, UnknownFieldError
+from caraware.tasks.foresight import NEVER_S, NOWHERE_M, ON_THE_WAY_S, STANDS_MPS, USERS
 
-USERS = 8
 LOOKS_M, JUNCTION_M = 45.0, 35.0
 """A stop line that is farther away is not looked at, nor an encounter that far behind the line."""
 HERO_MPS2, HERO_MPS = 2.0, 9.0
@@ -24,8 +24,6 @@ CLEARS_M = 7.6
 """From the hero's front to behind its rear, and room."""
 GAP_BEFORE_S, GAP_AFTER_S = 1.0, 0.5
 """Room in time before another that comes, and after one that has passed."""
-STANDS_MPS, NOWHERE_M, NEVER_S, ON_THE_WAY_S = 0.3, 49.0, 9.9, 0.2
-"""As in `caraware.tasks.foresight`."""
 LINE_ROOM_M, PLACE_ROOM_M, COMMITTED_M = 0.7, 1.5, 2.0
 """Where to stop before a line and before an encounter; inside a junction, nearer encounters are driven through."""
 LINE_MPS2, PLACE_MPS2, COMFORTABLE_MPS2 = 6.0, 8.0, 1.75
