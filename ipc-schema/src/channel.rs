@@ -126,6 +126,15 @@ fn road_users(run: &RunFile) -> usize {
     run.config.traffic.max_road_users as usize
 }
 
+/// Most heroes that SUMO gives advice for in a step: those that have just left count, too.
+fn advised_heroes(run: &RunFile) -> usize {
+    if run.config.advises_heroes() {
+        road_users(run)
+    } else {
+        0
+    }
+}
+
 /// Most `traffic-meta` messages without routes that one SUMO step takes: all road users may leave and as many come in it, and every
 /// traffic light may change.
 fn meta_messages(run: &RunFile) -> usize {
@@ -176,7 +185,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
     ChannelSpec {
         channel: Channel::Traffic,
         name: "traffic",
-        payload: "`[TrafficState]`",
+        payload: "`[TrafficState]`, `[HeroAdvice]`",
         sections: TrafficLayout::SECTIONS,
         dimensions: TrafficLayout::DIMENSIONS,
         producer: TrafficBridge,
@@ -185,7 +194,7 @@ pub const CHANNELS: [ChannelSpec; 15] = [
         window: RunFile::traffic_window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| TrafficLayout::sized(road_users(run)).len,
+        max_payload: |run| TrafficLayout::sized(road_users(run), advised_heroes(run)).len,
         queue_length: |run| traffic_frames(run) + SPARE_MESSAGES,
         in_hand: |run| two_batches(Channel::Traffic.queue_length(run)),
         is_used: |_| true,

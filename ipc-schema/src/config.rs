@@ -114,6 +114,12 @@ impl Config {
         serde_json::from_str(text)
     }
 
+    /// Whether SUMO's own driver is asked what it would have done with a hero.
+    #[must_use]
+    pub fn advises_heroes(&self) -> bool {
+        self.task.kind == TaskKind::Driving && self.observation.fields.contains(&Field::AdvisedAccel)
+    }
+
     /// Heroes alive at a time, at most; 0 if the task is not driving.
     #[must_use]
     pub fn heroes(&self) -> usize {

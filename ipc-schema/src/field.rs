@@ -30,6 +30,8 @@ pub enum FieldSource {
     Route,
     /// Road users, junctions, traffic lights and persons around a hero.
     Around,
+    /// What SUMO's own driver would have done with a hero.
+    Advice,
 }
 
 /// Which values of a field the normalised range stands for.
@@ -94,7 +96,7 @@ macro_rules! fields {
 }
 
 use FieldRange::{MapX, MapY, PlusMinus, UpTo, Within};
-use FieldSource::{Around, Delivery, Measurement, Route};
+use FieldSource::{Advice, Around, Delivery, Measurement, Route};
 use SensorKind::{Gnss, Imu, Lidar, SpeedSteering, Ultrasonic};
 
 const ACCELERATION: FieldRange = PlusMinus(|config| config.observation.accel_range_mps2);
@@ -483,6 +485,8 @@ fields! {
     Person2Left: "person_2_left", "m", BESIDE, Around;
     /// Second nearest person beside the route: speed to the left.
     Person2Speed: "person_2_speed", "m/s", WALKING, Around;
+    /// Acceleration that SUMO's own driver would have chosen in the last step, from where the hero was before it.
+    AdvisedAccel: "advised_accel", "m/s²", PlusMinus(|config| config.vehicle.max_decel_mps2), Advice;
 }
 
 /// Some fields of a preset.
@@ -516,7 +520,7 @@ const PAPER: PresetPart = PresetPart::Named(&[
 const WHEELS: PresetPart = PresetPart::Named(&[Field::Speed, Field::Steering]);
 
 /// Every preset of `observation.fields`.
-pub const FIELD_PRESETS: [FieldPreset; 5] = [
+pub const FIELD_PRESETS: [FieldPreset; 6] = [
     FieldPreset {
         name: "paper",
         parts: &[PAPER],
@@ -532,6 +536,15 @@ pub const FIELD_PRESETS: [FieldPreset; 5] = [
     FieldPreset {
         name: "driver",
         parts: &[WHEELS, PresetPart::All(Route), PresetPart::All(Around)],
+    },
+    FieldPreset {
+        name: "advised-driver",
+        parts: &[
+            WHEELS,
+            PresetPart::All(Route),
+            PresetPart::All(Around),
+            PresetPart::All(Advice),
+        ],
     },
     FieldPreset {
         name: "ultrasonic",
@@ -566,7 +579,7 @@ impl FieldSource {
     pub fn sensor(self) -> Option<SensorKind> {
         match self {
             Measurement(sensor) | Delivery(sensor) => Some(sensor),
-            Route | Around => None,
+            Route | Around | Advice => None,
         }
     }
 
@@ -575,7 +588,7 @@ impl FieldSource {
     pub fn task(self) -> Option<TaskKind> {
         match self {
             Measurement(_) | Delivery(_) => None,
-            Route | Around => Some(TaskKind::Driving),
+            Route | Around | Advice => Some(TaskKind::Driving),
         }
     }
 }
@@ -613,7 +626,7 @@ impl Field {
     pub const fn measurement_bit(self) -> u32 {
         match self.spec().source {
             Measurement(sensor) => sensor.bit(),
-            Delivery(_) | Route | Around => 0,
+            Delivery(_) | Route | Around | Advice => 0,
         }
     }
 }
@@ -718,6 +731,7 @@ mod tests {
         assert_eq!(driver[..16], driving);
         assert_eq!(driver.len(), 16 + AROUND);
         assert_eq!((driver[16], driver[138]), ("user_1_x", "person_2_speed"));
+        assert_eq!(names("advised-driver"), [&driver[..], &["advised_accel"]].concat());
         let (ultrasonic, caraware) = (names("ultrasonic"), names("caraware"));
         assert_eq!(ultrasonic[..11], caraware);
         assert_eq!(

@@ -22,7 +22,7 @@ use crate::{
     radar::{RadarDetection, RadarScan},
     section::{SectionSpec, WireElement, numpy_type},
     sensor::{SENSORS, SensorKind},
-    traffic::{RoutePoint, SignalMeta, TrafficState, VEHICLE_CLASSES, VehicleMeta},
+    traffic::{HeroAdvice, RoutePoint, SignalMeta, TrafficState, VEHICLE_CLASSES, VehicleMeta},
     world::{HeroView, SubStep, VehicleState},
 };
 
@@ -166,6 +166,7 @@ pub fn table() -> Vec<TypeLayout> {
             road_wheel_angle_rad,
             reserved
         }),
+        layout!(HeroAdvice { vehicle, accel_mps2 }),
         layout!(RoutePoint {
             x_m,
             y_m,
@@ -186,6 +187,7 @@ pub fn table() -> Vec<TypeLayout> {
             leader_gap_m,
             leader_speed_mps,
             signal_gap_m,
+            advised_accel_mps2,
             vehicle,
             around
         }),
@@ -388,6 +390,7 @@ records!(
     RadarDetection,
     Collision,
     EgoPose,
+    HeroAdvice,
     HeroView,
     LanePosition,
     LidarPoint,

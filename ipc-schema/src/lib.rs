@@ -77,4 +77,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 29;
+pub const SCHEMA_VERSION: u32 = 30;

@@ -260,11 +260,23 @@ payload_layout! {
     }
 }
 
+/// What SUMO's own driver would have done with a hero in this step, from where actions had brought it before.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct HeroAdvice {
+    /// Dense index of the hero.
+    pub vehicle: u32,
+    /// Acceleration along the lane, m/s²; SUMO's driver brakes as hard as it has to.
+    pub accel_mps2: f32,
+}
+
 payload_layout! {
-    /// Where the array of a `traffic` message lies.
-    TrafficLayout(road_users) {
+    /// Where the arrays of a `traffic` message lie.
+    TrafficLayout(road_users, advised) {
         /// `TrafficState [road_users]`.
         states: TrafficState, [road_users];
+        /// `HeroAdvice [advised]`, by ascending dense index; only if a hero's observation has it.
+        advice: HeroAdvice, [advised];
     }
 }
 

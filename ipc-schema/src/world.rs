@@ -227,6 +227,8 @@ pub struct HeroView {
     pub leader_speed_mps: f32,
     /// Distance from the front bumper to the next stop line with a signal that is not green, metres, at most [`SIGHT_M`].
     pub signal_gap_m: f32,
+    /// Acceleration that SUMO's own driver would have chosen in the last step, m/s²; 0 if it was not asked.
+    pub advised_accel_mps2: f32,
     /// Dense index of the hero within the episode.
     pub vehicle: u32,
     /// What is around it: [`SENSED_USERS`] road users, [`SEEN_CONFLICTS`] junctions, [`SEEN_SIGNALS`] traffic lights and [`SEEN_PERSONS`]
@@ -244,6 +246,7 @@ impl HeroView {
         leader_gap_m: 0.0,
         leader_speed_mps: 0.0,
         signal_gap_m: 0.0,
+        advised_accel_mps2: 0.0,
         vehicle: 0,
         around: [0.0; AROUND],
     };

@@ -176,8 +176,14 @@ impl CoreProcess {
             }
         }
         self.apply_metas(header.meta_messages)?;
-        let states: &[TrafficState] =
-            block::view(frame.payload(), TrafficLayout::of(&header).states).map_err(unreadable)?;
+        let layout = TrafficLayout::of(&header);
+        let states: &[TrafficState] = block::view(frame.payload(), layout.states).map_err(unreadable)?;
+        if let Some(actions) = &mut self.actions {
+            actions.add_advice(
+                &header,
+                block::view(frame.payload(), layout.advice).map_err(unreadable)?,
+            );
+        }
         self.mirror.accept(&header, states).map_err(unmirrored)?;
         for tick in 0..u32::try_from(ticks_per_frame).unwrap_or(u32::MAX) {
             if self

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from caraware.driving.dagger import BATCH, CorrectedPolicy, MixedDrivers, Pupil, SeenRows, varied
+from caraware.driving.dagger import BATCH, VARIED_BY, CorrectedPolicy, MixedDrivers, Pupil, SeenRows, varied
 from caraware.driving.right_of_way import RightOfWay, arrives_s
 from caraware.learn.encoders import FIELDS, GroupedNetwork
 from caraware.tasks.fields import Fields, UnknownFieldError
@@ -139,7 +139,7 @@ def test_a_pupil_learns_to_give_way_and_keeps_what_it_could() -> None:
     assert after["corrected_error"][1] < 0.35 * before["corrected_error"][1]
     assert before["other_error"] == [0.0, 0.0]
     assert after["other_error"][0] < 0.02 and after["other_error"][1] < 0.3 * before["corrected_error"][1]
-    assert float(varied(rows, BATCH, generator).abs().max()) <= 1.0
+    assert float(varied(rows, BATCH, VARIED_BY, generator).abs().max()) <= 1.0
 
 
 def test_the_teacher_drives_some_and_noise_all() -> None:

@@ -113,6 +113,7 @@ impl SensorReadings {
             Field::Ultrasonic11 => f64::from(self.ultrasonic_m[10]),
             Field::Ultrasonic12 => f64::from(self.ultrasonic_m[11]),
             Field::UltrasonicAge => f64::from(self.ages_s[SensorKind::Ultrasonic.index()]),
+            Field::AdvisedAccel => f64::from(self.view().advised_accel_mps2),
             Field::UltrasonicValid => deliver(SensorKind::Ultrasonic.bit()),
             around => around
                 .place_around()

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc};
 use ipc_schema::{
     config,
     ego::EgoPose,
-    traffic::{Kind, RoutePoint, SignalMeta},
+    traffic::{HeroAdvice, Kind, RoutePoint, SignalMeta},
     world::{
         ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, BLOCKED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD,
         RED_LIGHT, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState, vehicle_of,
@@ -114,6 +114,8 @@ struct HeroTrip {
     /// Since it moved last.
     standing_ticks: u64,
     over: bool,
+    /// What SUMO's own driver would have chosen in the last step, m/s².
+    advised_accel_mps2: f32,
 }
 
 /// A link of a traffic light.
@@ -205,6 +207,15 @@ impl<G: DrivableGround> DrivingTask<G> {
         }
     }
 
+    /// Takes what SUMO's own driver would have done in this tick.
+    pub fn add_advice(&mut self, advice: &[HeroAdvice]) {
+        for HeroAdvice { vehicle, accel_mps2 } in advice {
+            if let Some(trip) = self.trips.get_mut(vehicle) {
+                trip.advised_accel_mps2 = *accel_mps2;
+            }
+        }
+    }
+
     /// Takes states of traffic lights.
     pub fn add_signals(&mut self, signals: &[SignalMeta]) {
         for signal in signals {
@@ -266,7 +277,10 @@ impl<G: DrivableGround> DrivingTask<G> {
         let rows = (0..states.len()).filter(|&row| states[row].kind == Kind::Hero as u32);
         for (row, view) in rows.zip(views) {
             if let Some(trip) = self.trips.get(&states[row].vehicle) {
-                *view = self.view(&trip.route, trip.station_m.unwrap_or(0.0), row, (states, &bodies));
+                *view = HeroView {
+                    advised_accel_mps2: trip.advised_accel_mps2,
+                    ..self.view(&trip.route, trip.station_m.unwrap_or(0.0), row, (states, &bodies))
+                };
             }
         }
     }
@@ -385,6 +399,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             leader_gap_m: leader_gap_m as f32,
             leader_speed_mps: leader_speed_mps as f32,
             signal_gap_m: self.signal_gap_m(route, front_station_m) as f32,
+            advised_accel_mps2: 0.0,
             vehicle: hero.vehicle,
             around: surroundings::HeroSurroundings {
                 route,

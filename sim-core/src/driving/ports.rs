@@ -13,7 +13,7 @@ use ipc_schema::{
     ports::{Message, PortError, Publisher, Subscriber},
     prediction::{ACTION_COLUMNS, PredictionLayout},
     services::Channel,
-    traffic::{Kind, RoutePoint, SignalMeta, VehicleMeta},
+    traffic::{HeroAdvice, Kind, RoutePoint, SignalMeta, VehicleMeta},
     world::{HeroView, VehicleState, WorldLayout},
 };
 
@@ -81,6 +81,12 @@ impl HeroPorts {
             self.ids.insert(meta.vehicle, meta.id_text());
         }
         self.driving.add_signals(signals);
+    }
+
+    /// Adds what SUMO's own driver would have done with the heroes.
+    pub fn add_advice(&mut self, header: &MessageHeader, advice: &[HeroAdvice]) {
+        self.driving.enter_episode(header.episode);
+        self.driving.add_advice(advice);
     }
 
     /// Waits for the prediction to the observation before the tick of `frame`, and applies its actions to the heroes. Actions that an

@@ -112,6 +112,16 @@ fn a_hero_sees_its_route_what_is_on_it_and_the_signal() {
     );
 }
 
+#[test]
+fn a_hero_sees_the_advice_on_its_last_step_and_not_that_on_others() {
+    let mut driving = driving();
+    let advice = |vehicle, accel_mps2| HeroAdvice { vehicle, accel_mps2 };
+    let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
+    assert_eq!(tick(&mut driving, &mut states).0.advised_accel_mps2, 0.0);
+    driving.add_advice(&[advice(2, 1.0), advice(3, -4.5), advice(4, 2.0)]);
+    assert_eq!(tick(&mut driving, &mut states).0.advised_accel_mps2, -4.5);
+}
+
 /// A leader's trailer is nearer than the leader, and a hero's own bodies are not in its way.
 #[test]
 fn a_hero_sees_the_trailer_ahead_and_not_its_own() {

@@ -222,6 +222,13 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "set vehicle.hero_model = \"dynamic\" with task.driver = \"sumo\"",
         ));
     }
+    if config.task.driver == HeroDriver::Sumo && config.advises_heroes() {
+        return Some((
+            "observation.fields",
+            "`advised_accel` is what SUMO's driver would do where actions drive, but `task.driver` = \"sumo\"".into(),
+            "set observation.fields = \"driver\", or task.driver = \"actions\"",
+        ));
+    }
     if config.task.driver == HeroDriver::Sumo && config.trainer.module == OWN_TRAINER {
         return Some((
             "task.driver",

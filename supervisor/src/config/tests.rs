@@ -480,6 +480,19 @@ fn a_view_of_the_road_ahead_is_for_heroes_that_sumo_drives() {
     assert!(help.contains("task.driver = \"sumo\""), "{help}");
 }
 
+#[test]
+fn sumo_is_not_asked_for_advice_where_it_drives() {
+    let advised = "trainer.module = \"caraware.driving.dagger\"\ntask.kind = \"driving\"\ntraffic.heroes = 1\nobservation.fields = \"advised-driver\"\n";
+    assert!(config_of(advised).is_ok_and(|config| config.advises_heroes()));
+    let driven = "task.driver = \"sumo\"\n";
+    let (message, help) = error_of(&format!("{advised}{driven}"));
+    assert!(
+        message.contains("`advised_accel` is what SUMO's driver would do"),
+        "{message}"
+    );
+    assert!(help.contains("observation.fields = \"driver\""), "{help}");
+}
+
 /// A decision of one trainer is not that of the others, and lessons end at other ticks in each environment.
 #[test]
 fn several_environments_count_the_lessons_of_a_stage() {

@@ -3,6 +3,7 @@
 use ipc_schema::{
     activity::Awaited,
     config::{HeroDriver, TrafficConfig, TrafficEngine},
+    ego::EgoPose,
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
@@ -252,12 +253,15 @@ impl Bridge {
             if self.wait_to_send(tick, sumo, population.as_mut(), episode, frame)? == Wait::Stopped {
                 return Ok(EpisodeEnd::Stopped);
             }
-            if self.move_heroes(sumo, episode, frame)? == Wait::Stopped {
+            let Some(moved) = self.move_heroes(sumo, episode, frame)? else {
                 return Ok(EpisodeEnd::Stopped);
-            }
+            };
 
             // Step SUMO, and determine what ends with the step.
             sumo.step(frame)?;
+            if self.membership.run.config.advises_heroes() {
+                frame.advice = heroes::advice(sumo, frame, &moved)?;
+            }
             self.commands.track_presence(&frame.events);
             if let Some(ids) = &mut self.ids {
                 ids.add(&frame.departed_ids);
@@ -281,7 +285,8 @@ impl Bridge {
                 return Ok(EpisodeEnd::Stopped);
             }
             if self.poses.is_some() {
-                let points = heroes::take_over(sumo, frame, self.membership.run.config.task.driver)?;
+                let config = &self.membership.run.config;
+                let points = heroes::take_over(sumo, frame, config.task.driver, config.advises_heroes())?;
                 self.outbox.publish_routes(&points, header)?;
             }
             let header = match interpolation {
@@ -397,18 +402,24 @@ impl Bridge {
         Ok(waited)
     }
 
-    /// In the driving task: waits for the poses of the last tick sent and moves the heroes of `frame`, its step, to them.
-    fn move_heroes(&mut self, sumo: &mut Sumo, episode: &Episode, frame: &TrafficFrame) -> Result<Wait, Failure> {
+    /// In the driving task: waits for the poses of the last tick sent and moves the heroes of `frame`, its step, to them. Returns the poses
+    /// if SUMO is asked for advice, and `None` once the process is asked to stop.
+    fn move_heroes(
+        &mut self,
+        sumo: &mut Sumo,
+        episode: &Episode,
+        frame: &TrafficFrame,
+    ) -> Result<Option<Vec<EgoPose>>, Failure> {
         let Some(poses) = &self.poses else {
-            return Ok(Wait::Ready);
+            return Ok(Some(Vec::new()));
         };
         // No pose comes before the first tick of this process.
         let is_later = self.totals.ticks > self.membership.run.first_tick();
         let Some(before) = self.totals.ticks.checked_sub(1).filter(|_| is_later) else {
-            return Ok(Wait::Ready);
+            return Ok(Some(Vec::new()));
         };
         let Some(message) = self.membership.next(poses)? else {
-            return Ok(Wait::Stopped);
+            return Ok(None);
         };
         let header = message.header();
         if header.tick != before {
@@ -422,9 +433,13 @@ impl Bridge {
         // Poses of the episode before belong to heroes that ended with it.
         if header.episode == self.episode_number(episode) {
             let poses = heroes::poses(&message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
-            heroes::apply(sumo, frame, poses, self.membership.run.config.task.driver)?;
+            let config = &self.membership.run.config;
+            heroes::apply(sumo, frame, poses, config.task.driver)?;
+            if config.advises_heroes() {
+                return Ok(Some(poses.to_vec()));
+            }
         }
-        Ok(Wait::Ready)
+        Ok(Some(Vec::new()))
     }
 
     fn episode_ends(&self, sumo: &Sumo, episode: &Episode, frame: &TrafficFrame) -> Result<bool, SumoError> {

@@ -68,7 +68,7 @@ impl Outbox {
         header: MessageHeader,
     ) -> Result<MessageHeader, Failure> {
         self.publish_meta(frame, header)?;
-        let layout = TrafficLayout::sized(frame.states.len());
+        let layout = TrafficLayout::sized(frame.states.len(), frame.advice.len());
         let header = MessageHeader {
             shape: layout.shape,
             meta_messages: self.meta_messages,
@@ -78,7 +78,10 @@ impl Outbox {
         if let Some(lanes) = &mut self.lanes {
             lanes.publish(frame, header)?;
         }
-        send(&self.traffic, header, layout.len, layout.states, &frame.states)?;
+        let mut draft = self.traffic.loan(header, layout.len).map_err(too_many)?;
+        copy(&frame.states, layout.states, draft.payload_mut());
+        copy(&frame.advice, layout.advice, draft.payload_mut());
+        draft.send()?;
         self.consumers.sent(header.tick);
         if let Some((publisher, census)) = &mut self.census {
             census.add_step(frame);
@@ -147,10 +150,13 @@ fn send<T: bytemuck::Pod>(
     rows: &[T],
 ) -> Result<(), Failure> {
     let mut draft = publisher.loan(header, len).map_err(too_many)?;
-    let at = section.offset..section.offset + section.len;
-    draft.payload_mut()[at].copy_from_slice(bytemuck::cast_slice(rows));
+    copy(rows, section, draft.payload_mut());
     draft.send()?;
     Ok(())
+}
+
+fn copy<T: bytemuck::Pod>(rows: &[T], section: Section, payload: &mut [u8]) {
+    payload[section.offset..section.offset + section.len].copy_from_slice(bytemuck::cast_slice(rows));
 }
 
 /// The user can settle this failure: the configuration reserves room for fewer road users than there are.

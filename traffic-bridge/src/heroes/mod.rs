@@ -12,7 +12,7 @@ use ipc_schema::{
     config::HeroDriver,
     ego::{EgoPose, EgoPoseLayout},
     ports::Message,
-    traffic::{Kind, MetaEvent, ROUTE_POINTS_PER_MESSAGE, RoutePoint},
+    traffic::{HeroAdvice, Kind, MetaEvent, ROUTE_POINTS_PER_MESSAGE, RoutePoint},
 };
 
 use crate::sumo::{
@@ -31,10 +31,16 @@ pub fn poses(message: &Message) -> Result<&[EgoPose], BlockError> {
 }
 
 /// Takes control of the heroes that departed in this step, unless SUMO drives them, and returns the points of their routes.
+/// With `is_advised` SUMO's own driver can still say what it would do ([`advice`]).
 ///
 /// # Errors
 /// SUMO does not know them.
-pub fn take_over(sumo: &mut Sumo, frame: &TrafficFrame, driver: HeroDriver) -> Result<Vec<RoutePoint>, SumoError> {
+pub fn take_over(
+    sumo: &mut Sumo,
+    frame: &TrafficFrame,
+    driver: HeroDriver,
+    is_advised: bool,
+) -> Result<Vec<RoutePoint>, SumoError> {
     let mut points = Vec::new();
     let departed = frame
         .events
@@ -42,7 +48,8 @@ pub fn take_over(sumo: &mut Sumo, frame: &TrafficFrame, driver: HeroDriver) -> R
         .filter(|event| event.kind == Kind::Hero as u32 && event.event == MetaEvent::Departed as u32);
     for event in departed {
         if driver == HeroDriver::Actions {
-            called("take over a hero", sumo.simulation_mut().take_over(event.vehicle))?;
+            let taken = sumo.simulation_mut().take_over(event.vehicle, is_advised);
+            called("take over a hero", taken)?;
         }
         let simulation = sumo.simulation();
         let lane = called("report a hero's lane", simulation.lane_index(event.vehicle))?;
@@ -93,6 +100,28 @@ pub fn apply(sumo: &mut Sumo, frame: &TrafficFrame, poses: &[EgoPose], driver: H
         called("move a hero", done)?;
     }
     Ok(())
+}
+
+/// What SUMO's own driver would have done in the step of `frame` with the heroes that `poses` had moved before it, as long as they are there.
+///
+/// # Errors
+/// SUMO does not know them.
+pub fn advice(sumo: &Sumo, frame: &TrafficFrame, poses: &[EgoPose]) -> Result<Vec<HeroAdvice>, SumoError> {
+    let is_there = |pose: &&EgoPose| {
+        let states = &frame.states;
+        pose.flags == 0
+            && states
+                .binary_search_by_key(&pose.vehicle, |state| state.vehicle)
+                .is_ok()
+    };
+    let advised = poses.iter().filter(is_there).map(|pose| {
+        let own_mps = called("ask a hero's driver", sumo.simulation().own_speed(pose.vehicle))?;
+        Ok(HeroAdvice {
+            vehicle: pose.vehicle,
+            accel_mps2: ((own_mps - pose.speed_mps) / sumo.step_s()) as f32,
+        })
+    });
+    advised.collect()
 }
 
 /// Where the front bumper will be after a step straight ahead.

@@ -74,8 +74,9 @@ public:
     void add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) override;
     void remove_vehicle(rust::Str id) override;
     void add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) override;
-    void take_over(std::uint32_t index) override;
+    void take_over(std::uint32_t index, bool keeps_limits) override;
     void move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) override;
+    double own_speed(std::uint32_t index) const override;
     void remove_by_index(std::uint32_t index) override;
     std::int32_t lane_index(std::uint32_t index) const override;
     rust::Vec<RawLane> route_lanes(std::uint32_t index) const override;

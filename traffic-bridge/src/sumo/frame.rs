@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use ipc_schema::{
     lane_position::{LanePosition, NO_INDEX},
-    traffic::{Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes},
+    traffic::{
+        HeroAdvice, Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes,
+    },
 };
 
 use super::{
@@ -25,6 +27,8 @@ pub struct TrafficFrame {
     /// The road users in SUMO's terms and the persons in vehicles, by ascending dense index, if they are read
     /// ([`super::Sumo::read_positions`]); otherwise empty.
     pub positions: Vec<LanePosition>,
+    /// What SUMO's own driver would have done with heroes in this step, if it is asked; otherwise empty.
+    pub advice: Vec<HeroAdvice>,
     /// Arrivals, departures and teleports of this step.
     pub events: Vec<VehicleMeta>,
     /// Ids of the road users that departed in this step, in the order of `events`.

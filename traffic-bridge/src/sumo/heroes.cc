@@ -17,6 +17,8 @@ namespace {
 constexpr int FREE_MOVEMENT = 2;
 // Largest distance from a lane at which SUMO still matches a hero to it, metres.
 constexpr double MATCH_THRESHOLD_M = 20.0;
+// SUMO's own driver gives way at junctions and stops at red; what it would do is not done, so nothing else is checked.
+constexpr int GIVES_WAY_AND_STOPS = 8 + 16;
 // Factor on speed limits, speed (m/s) and deceleration (m/s²) that no hero reaches.
 constexpr double UNLIMITED = 100.0;
 // A link through a junction has at most two internal lanes in sequence; more would be a loop.
@@ -87,10 +89,17 @@ void EngineSimulation::add_vehicle_at_start(rust::Str id, rust::Str vehicle_type
     engine::Vehicle::add(name, name, text(vehicle_type), "now", "best", "base", "0");
 }
 
-void EngineSimulation::take_over(std::uint32_t index) {
+void EngineSimulation::take_over(std::uint32_t index, bool keeps_limits) {
     const std::string& id = known_id(index);
-    engine::Vehicle::setSpeedMode(id, 0);
     engine::Vehicle::setLaneChangeMode(id, 0);
+    if (keeps_limits) {
+        engine::Vehicle::setSpeedMode(id, GIVES_WAY_AND_STOPS);
+        engine::Vehicle::setImperfection(id, 0.0);
+        engine::Vehicle::setSpeedFactor(id, 1.0);
+        engine::Vehicle::setEmergencyDecel(id, UNLIMITED);
+        return;
+    }
+    engine::Vehicle::setSpeedMode(id, 0);
     // SUMO computes a moved vehicle's speed from the distance it covers, but never above these limits.
     engine::Vehicle::setSpeedFactor(id, UNLIMITED);
     engine::Vehicle::setMaxSpeed(id, UNLIMITED);
@@ -102,6 +111,8 @@ void EngineSimulation::move_vehicle(std::uint32_t index, double x, double y, dou
     engine::Vehicle::moveToXY(id, "", -1, x, y, angle, FREE_MOVEMENT, MATCH_THRESHOLD_M);
     engine::Vehicle::setPreviousSpeed(id, speed, acceleration);
 }
+
+double EngineSimulation::own_speed(std::uint32_t index) const { return engine::Vehicle::getSpeedWithoutTraCI(known_id(index)); }
 
 void EngineSimulation::remove_by_index(std::uint32_t index) {
     if (const std::string* id = id_of(index); id != nullptr) {

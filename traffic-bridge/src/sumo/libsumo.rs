@@ -217,8 +217,9 @@ pub mod ffi {
             vehicle_type: &str,
             route: &[String],
         ) -> Result<()>;
-        /// From now on SUMO no longer controls speed and lane of the vehicle with this dense index.
-        fn take_over(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
+        /// From now on SUMO no longer controls speed and lane of the vehicle with this dense index. With `keeps_limits` SUMO's own driver
+        /// still has its rules and the speed limits, so that `own_speed` says what it would do; else the vehicle may have any speed.
+        fn take_over(self: Pin<&mut Simulation>, index: u32, keeps_limits: bool) -> Result<()>;
         /// Puts the vehicle's front bumper there at the end of the next step (`angle` in degrees clockwise from north);
         /// until then other vehicles react to this speed and acceleration.
         fn move_vehicle(
@@ -230,6 +231,8 @@ pub mod ffi {
             speed: f64,
             acceleration: f64,
         ) -> Result<()>;
+        /// Speed that SUMO's own driver would have brought the vehicle to in the last step, m/s.
+        fn own_speed(self: &Simulation, index: u32) -> Result<f64>;
         /// Removes the vehicle with this dense index; does nothing if there is no such vehicle.
         fn remove_by_index(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
         /// Number of the lane on which the vehicle is, from the right.

@@ -61,8 +61,9 @@ public:
     virtual void add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) = 0;
     virtual void remove_vehicle(rust::Str id) = 0;
     virtual void add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) = 0;
-    virtual void take_over(std::uint32_t index) = 0;
+    virtual void take_over(std::uint32_t index, bool keeps_limits) = 0;
     virtual void move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) = 0;
+    virtual double own_speed(std::uint32_t index) const = 0;
     virtual void remove_by_index(std::uint32_t index) = 0;
     virtual std::int32_t lane_index(std::uint32_t index) const = 0;
     virtual rust::Vec<RawLane> route_lanes(std::uint32_t index) const = 0;

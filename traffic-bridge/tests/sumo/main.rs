@@ -1,6 +1,7 @@
 //! Tests with real SUMO, and nets built by the wheel's own tools.
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
 
+mod advice;
 mod interpolation;
 mod lifecycle;
 mod objects;

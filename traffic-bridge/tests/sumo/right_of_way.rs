@@ -64,7 +64,7 @@ fn a_way_that_gives_way_to_people_alone_has_right_of_way_among_vehicles() {
         for event in frame.events.iter().filter(|event| event.kind == Kind::Hero as u32) {
             ids.insert(event.vehicle, event.id_text());
         }
-        for point in take_over(&mut sumo, &frame, HeroDriver::Sumo).unwrap() {
+        for point in take_over(&mut sumo, &frame, HeroDriver::Sumo, false).unwrap() {
             found.entry(ids[&point.vehicle].clone()).or_default().insert(point.way);
         }
     }

@@ -34,7 +34,7 @@ fn routes(sumo: &mut Sumo, turns: HeroTurns) -> BTreeMap<u32, Vec<RoutePoint>> {
     let mut population = Population::start(sumo, SIZE, heroes, 5).unwrap();
     let mut routes: BTreeMap<u32, Vec<RoutePoint>> = BTreeMap::new();
     run(sumo, 60, |sumo, frame| {
-        for point in heroes::take_over(sumo, frame, HeroDriver::Sumo).unwrap() {
+        for point in heroes::take_over(sumo, frame, HeroDriver::Sumo, false).unwrap() {
             routes.entry(point.vehicle).or_default().push(point);
         }
         population.after_step(sumo, frame).unwrap();

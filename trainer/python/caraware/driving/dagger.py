@@ -1,8 +1,9 @@
-"""Teaches a policy, where it drives itself, what a rule would have done: imitation by dataset aggregation (DAgger).
+"""Teaches a policy, where it drives itself, what a teacher would have done: imitation by dataset aggregation (DAgger).
 
 Runs as `trainer.module` of a run that begins from a policy (`task.begin_from`). The pupil drives the heroes, and now
 and then the teacher does for a few seconds. The teacher is the policy of the beginning, corrected by
-`caraware.driving.right_of_way`. The pupil learns from what heroes have seen so far, a batch in each tick. It writes
+`caraware.driving.right_of_way`, or by SUMO's own driver (`caraware.driving.advice`) if the observation has
+`advised_accel`. The pupil learns from what heroes have seen so far, a batch in each tick. It writes
 `taught.safetensors` into the run's directory, for `task.begin_from` (docs/driving.md). The method is that of Ross,
 Gordon and Bagnell, arXiv 1011.0686.
 """
@@ -10,15 +11,18 @@ Gordon and Bagnell, arXiv 1011.0686.
 import copy
 import logging
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from caraware.driving.advice import SumoAdvice
 from caraware.driving.right_of_way import RightOfWay
+from caraware.ipc.arrays import BoolArray, UInt32Array
 from caraware.ipc.channel import Channel, Observation
 from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import ConfigError, config_table
@@ -49,7 +53,10 @@ NOISE, NOISE_KEEPS = (0.03, 0.15), 0.9
 UNIT = (0.02, 0.15)
 """Errors of steering and acceleration that count alike."""
 CORRECTED_WEIGHT, CORRECTED_FROM = 3.0, 0.02
-"""Rows in which the rule changed the action by more than this count so many times."""
+"""Rows in which the teacher changed the action by more than this count so many times."""
+ADVISED_CAUTION, ADVISED_VARIED_BY = 3.0, 0.01
+"""SUMO's driver knows more than a hero sees: where the hero only brakes as it would, to accelerate more counts so many
+times what braking more does. And its advice is kept for rows with as little noise as this."""
 
 
 class SeenRows:
@@ -80,29 +87,91 @@ class SeenRows:
         return self._seen[torch.randint(len(self), (count,), generator=self._generator)].float()
 
 
+class Teacher(Protocol):
+    """Says what should have been done."""
+
+    varied_by: float
+    """Noise, of −1 … 1, up to which its answer for a row is kept."""
+
+    def actions(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions f32 `[n, 2]` for rows `[n, d]`, and bool `[n]`: here it differs from the policy of the beginning."""
+
+    def caution(self, seen: Tensor) -> Tensor:
+        """f32 `[n]`: how many times as much it counts to accelerate more than the teacher as to accelerate less."""
+
+
 class CorrectedPolicy:
     """The policy of the beginning, corrected by the rule. It has an answer for any row, also for one never seen."""
+
+    varied_by = VARIED_BY
 
     def __init__(self, network: nn.Module, rule: RightOfWay) -> None:
         self._network, self._rule = network, rule
 
     def actions(self, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions f32 `[n, 2]` for rows `[n, d]`, and bool `[n]`: the rule has changed this one."""
+        """See the protocol."""
         with torch.no_grad():
             own = self._network(seen).clamp(-1, 1)
             wanted = self._rule.corrected(seen, own)
         return wanted, (wanted - own).abs().amax(1) > CORRECTED_FROM
 
+    def caution(self, seen: Tensor) -> Tensor:
+        """See the protocol."""
+        return torch.ones(len(seen))
 
-def varied(rows: SeenRows, count: int, generator: torch.Generator) -> Tensor:
+
+class AdvisedPolicy:
+    """The policy of the beginning, corrected by SUMO's driver where it was asked: rows `[n, FIELDS + 1]`.
+
+    The last column is the advice on the tick of the row, m/s²; a row without advice (NaN) teaches what the policy does.
+    """
+
+    varied_by = ADVISED_VARIED_BY
+
+    def __init__(self, network: nn.Module, advice: SumoAdvice) -> None:
+        self._network, self._advice = network, advice
+
+    def actions(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """See the protocol."""
+        with torch.no_grad():
+            own = self._network(seen[:, :FIELDS]).clamp(-1, 1)
+            wanted = self._advice.corrected(seen, own, seen[:, FIELDS])
+        wanted = torch.where(seen[:, FIELDS:].isnan(), own, wanted)
+        return wanted, (wanted - own).abs().amax(1) > CORRECTED_FROM
+
+    def caution(self, seen: Tensor) -> Tensor:
+        """See the protocol."""
+        return torch.where(self._advice.does(seen) & ~seen[:, FIELDS].isnan(), 1.0, ADVISED_CAUTION)
+
+
+@dataclass
+class AdvisedRows:
+    """Pairs what heroes saw in a tick with the advice on it, which comes with the next."""
+
+    advice: SumoAdvice
+    _before: tuple[int, UInt32Array, BoolArray, Tensor] | None = None
+
+    def add(self, obs: Observation, seen: Tensor) -> Tensor:
+        """Take a tick whose rows are `[n, FIELDS + 1]`; return the rows of the tick before with their advice."""
+        before, there = self._before, obs.valid & ~(obs.terminated | obs.truncated)
+        self._before = (obs.tick, obs.vehicle.copy(), there, seen)
+        if before is None or before[0] + 1 != obs.tick or len(before[1]) != len(obs.vehicle):
+            return seen[:0]
+        _, vehicle, was_there, rows = before
+        at = torch.from_numpy(was_there & there & (vehicle == obs.vehicle))
+        return torch.cat([rows[at, :FIELDS], self.advice.of(seen[at]).unsqueeze(1)], 1)
+
+
+def varied(rows: SeenRows, count: int, varied_by: float, generator: torch.Generator) -> Tensor:
     """Rows f32 `[count, d]`: as they were seen, with noise, with another hero's own fields, and of mixed groups.
 
     A pupil that is taught the rows alone forgets on other maps what it could: there it drove against the traffic.
+    Advice behind the fields is lost with the fields of another hero.
     """
     seen = rows.drawn(count)
     first, second, third = (int(count * share) for share in SHARES)
-    noise = torch.randn(second - first, seen.shape[1], generator=generator)
-    seen[first:second] += 2 * VARIED_BY * noise * torch.rand(second - first, 1, generator=generator)
+    noise = torch.randn(second - first, FIELDS, generator=generator)
+    seen[first:second, :FIELDS] += 2 * varied_by * noise * torch.rand(second - first, 1, generator=generator)
     others = rows.drawn(third - second)[:, :EGO]
     noise = torch.randn(others.shape, generator=generator) * torch.rand(len(others), 1, generator=generator)
     seen[second:third, :EGO] = others + VARIED_BY * noise
@@ -111,23 +180,25 @@ def varied(rows: SeenRows, count: int, generator: torch.Generator) -> Tensor:
         after = at + group.members * group.columns
         seen[third:, at:after] = rows.drawn(count - third)[:, at:after]
         at = after
-    return seen.clamp(-1, 1)
+    seen[second:, FIELDS:] = torch.nan
+    return torch.cat([seen[:, :FIELDS].clamp(-1, 1), seen[:, FIELDS:]], 1)
 
 
 class Pupil:
     """The policy that learns, by regression."""
 
-    def __init__(self, network: nn.Module, teacher: CorrectedPolicy, generator: torch.Generator) -> None:
+    def __init__(self, network: nn.Module, teacher: Teacher, generator: torch.Generator) -> None:
         self.network, self._teacher, self._generator = network, teacher, generator
         self._optimiser = ModuleAdam(network.parameters())
         self._unit = torch.tensor(UNIT)
 
     def learn(self, rows: SeenRows, learning_rate: float) -> None:
         """One step on rows drawn at random and varied: Huber's loss of the error in units."""
-        seen = varied(rows, BATCH, self._generator)
+        seen = varied(rows, BATCH, self._teacher.varied_by, self._generator)
         actions, corrected = self._teacher.actions(seen)
-        error = (self.network(seen) - actions) / self._unit
-        loss = nn.functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none").sum(1)
+        error = (self.network(seen[:, :FIELDS]) - actions) / self._unit
+        loss = nn.functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
+        loss = loss[:, 0] + torch.where(error[:, 1] > 0, self._teacher.caution(seen), 1.0) * loss[:, 1]
         weights = torch.where(corrected, CORRECTED_WEIGHT, 1.0)
         self._optimiser.zero_grad()
         ((loss * weights).sum() / weights.sum()).backward()
@@ -138,7 +209,7 @@ class Pupil:
         with torch.no_grad():
             seen = rows.drawn(20_000)
             actions, corrected = self._teacher.actions(seen)
-            error = (self.network(seen).clamp(-1, 1) - actions).abs()
+            error = (self.network(seen[:, :FIELDS]).clamp(-1, 1) - actions).abs()
         parts = {"corrected_error": error[corrected], "other_error": error[~corrected]}
         return {name: part.mean(0).tolist() for name, part in parts.items() if len(part)}
 
@@ -173,17 +244,26 @@ def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
     if not isinstance(task, Driving) or not begin:
         raise ConfigError("there is no policy to correct", 'set task.kind = "driving" and task.begin_from')
     configure_torch(config)
-    ppo = build_ppo(config, task.fields.width, task)
+    advice = SumoAdvice.from_run(run)
+    is_advised = advice.is_there()
+    if task.fields.width != FIELDS + is_advised:
+        raise ConfigError(
+            "the teacher needs the preset's fields",
+            'set observation.fields = "driver", or "advised-driver", without a history',
+        )
+    ppo = build_ppo(config, FIELDS, task)
     if not isinstance(ppo.updater, PlainUpdate):
         raise ConfigError(
             f"`trainer.network` is '{config.network}'", "a pupil needs a network of a class, which learns by autograd"
         )
-    if task.fields.width != FIELDS:
-        raise ConfigError("the rule needs the preset's fields", 'set observation.fields = "driver", without a history')
     begin_from(ppo.updater.parameters(), Path(begin))
     generator = torch.Generator().manual_seed(config.seed)
     network, rows = ppo.updater.policy.network, SeenRows(CAPACITY, generator)
-    teacher = CorrectedPolicy(copy.deepcopy(network), RightOfWay.from_run(run))
+    begins = copy.deepcopy(network)
+    teacher: Teacher = (
+        AdvisedPolicy(begins, advice) if is_advised else CorrectedPolicy(begins, RightOfWay.from_run(run))
+    )
+    paired = AdvisedRows(advice)
     pupil, drivers = Pupil(network, teacher, generator), MixedDrivers(config.seed)
     channel, ended, lessons = Channel(str(run_file)), False, 0
 
@@ -191,14 +271,17 @@ def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         nonlocal lessons
         seen = torch.nan_to_num(obs.observation)
         with torch.no_grad():
-            own: Tensor = pupil.network(seen).clamp(-1, 1)
+            own: Tensor = pupil.network(seen[:, :FIELDS]).clamp(-1, 1)
         if obs.evaluation:
             return own
-        rows.add(seen[torch.from_numpy(obs.valid & ~(obs.terminated | obs.truncated))])
+        there = torch.from_numpy(obs.valid & ~(obs.terminated | obs.truncated))
+        rows.add(paired.add(obs, seen) if is_advised else seen[there])
         if len(rows) >= FIRST_ROWS:
             pupil.learn(rows, LEARNING_RATE)
             lessons += 1
-        return drivers.actions(own, teacher.actions(seen)[0])
+        # Where the teacher drives, it has the advice on the tick before.
+        shown = torch.cat([seen[:, :FIELDS], advice.of(seen).unsqueeze(1)], 1) if is_advised else seen
+        return drivers.actions(own, teacher.actions(shown)[0])
 
     while not (ended or stop.requested):
         for obs in channel.receive(0.2):
