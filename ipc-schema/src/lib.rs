@@ -2,7 +2,7 @@
 //!
 //! | service | payload (64-byte aligned bytes, little endian) | producer | required consumers |
 //! |---|---|---|---|
-//! | `traffic` | `[TrafficState]` | traffic-bridge | sim-core, recorder |
+//! | `traffic` | `[TrafficState]`, `[HeroAdvice]` | traffic-bridge | sim-core, recorder |
 //! | `traffic-meta` | `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core |
 //! | `census` | as `traffic-meta`: every road user and every light | traffic-bridge | none |
 //! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon, v2x, recorder |
