@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::support::{Bench, own_options, sumo_home};
+use crate::support::Bench;
 use ipc_schema::{
     config::HeroDriver,
     ego::EgoPose,
@@ -10,43 +10,17 @@ use ipc_schema::{
 };
 use traffic_bridge::{
     heroes::{advice, apply, take_over},
-    sumo::{Sumo, connected::ConnectedRule, frame::TrafficFrame, options::SumoOptions},
+    sumo::frame::TrafficFrame,
 };
 
 /// Heroes on an edge of the town, whose end is straight, and where they depart, metres. The one ahead stands.
-const HEROES: [(&str, &str); 2] = [("ahead", "95"), ("behind", "60")];
+const HEROES: [(&str, f64); 2] = [("ahead", 95.0), ("behind", 60.0)];
 
 /// What SUMO's driver would have done with the hero behind, moved straight ahead at this speed, by its gap to the one ahead: m and m/s².
 fn advised(speed_mps: f64, is_alone: bool) -> Vec<(f64, f64)> {
     let bench = Bench::new();
-    let (net, _) = bench.town();
-    let heroes = &HEROES[usize::from(is_alone)..];
-    let vehicle = |(id, at): &(&str, &str)| {
-        format!(
-            "<vehicle id=\"{id}\" depart=\"0\" departPos=\"{at}\"><route edges=\"ring_west_1 ring_west_2\"/></vehicle>"
-        )
-    };
-    let vehicles: String = heroes.iter().map(vehicle).collect();
-    bench.file("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
-    let scenario = bench.file(
-        "a.sumocfg",
-        "<configuration><input><net-file value=\"town.net.xml\"/><route-files value=\"a.rou.xml\"/></input></configuration>",
-    );
-    let options = SumoOptions::scenario(
-        &sumo_home(),
-        &scenario,
-        &own_options(&net, &["a.rou.xml"]),
-        &bench.folder.path().join("sumo"),
-        0.1,
-        23423,
-        ConnectedRule::Scenario {
-            heroes: heroes.iter().map(|(id, _)| (*id).to_owned()).collect(),
-            cav_share: 0.0,
-            max_cavs: 0,
-        },
-    )
-    .unwrap();
-    let mut sumo = Sumo::start(options).unwrap();
+    let heroes = HEROES.map(|(id, at_m)| (id, at_m, "ring_west_1 ring_west_2"));
+    let mut sumo = bench.town_of_heroes(&heroes[usize::from(is_alone)..]);
     let (mut frame, mut ids) = (TrafficFrame::default(), BTreeMap::new());
     let mut seen = Vec::new();
     while seen.len() < 50 {

@@ -2,15 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::support::{Bench, own_options, sumo_home};
+use crate::support::Bench;
 use ipc_schema::{
     config::HeroDriver,
     traffic::{Kind, ON_EDGE, RIGHT_OF_WAY, YIELDS},
 };
-use traffic_bridge::{
-    heroes::take_over,
-    sumo::{Sumo, connected::ConnectedRule, frame::TrafficFrame, options::SumoOptions},
-};
+use traffic_bridge::{heroes::take_over, sumo::frame::TrafficFrame};
 
 /// Two edges of the town and the way between them. All of these ways lead over zebra crossings, which SUMO counts as foes.
 const WAYS: [(&str, u32); 6] = [
@@ -28,34 +25,13 @@ const WAYS: [(&str, u32); 6] = [
 #[test]
 fn a_way_that_gives_way_to_people_alone_has_right_of_way_among_vehicles() {
     let bench = Bench::new();
-    let (net, _) = bench.town();
-    let vehicles: String = WAYS
+    let names: Vec<String> = (0..WAYS.len()).map(|number| number.to_string()).collect();
+    let heroes: Vec<(&str, f64, &str)> = names
         .iter()
-        .enumerate()
-        .map(|(number, (edges, _))| {
-            format!("<vehicle id=\"{number}\" depart=\"0\"><route edges=\"{edges}\"/></vehicle>")
-        })
+        .zip(WAYS)
+        .map(|(id, (edges, _))| (id.as_str(), 0.0, edges))
         .collect();
-    bench.file("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
-    let scenario = bench.file(
-        "a.sumocfg",
-        "<configuration><input><net-file value=\"town.net.xml\"/><route-files value=\"a.rou.xml\"/></input></configuration>",
-    );
-    let options = SumoOptions::scenario(
-        &sumo_home(),
-        &scenario,
-        &own_options(&net, &["a.rou.xml"]),
-        &bench.folder.path().join("sumo"),
-        0.1,
-        23423,
-        ConnectedRule::Scenario {
-            heroes: (0..WAYS.len()).map(|number| number.to_string()).collect(),
-            cav_share: 0.0,
-            max_cavs: 0,
-        },
-    )
-    .unwrap();
-    let mut sumo = Sumo::start(options).unwrap();
+    let mut sumo = bench.town_of_heroes(&heroes);
     let (mut frame, mut ids) = (TrafficFrame::default(), BTreeMap::new());
     let mut found: BTreeMap<String, BTreeSet<u32>> = BTreeMap::new();
     while found.len() < WAYS.len() {

@@ -67,6 +67,34 @@ impl Bench {
         net
     }
 
+    /// SUMO with the town and these vehicles, all of them heroes: id, where it departs (metres), and the edges of its route.
+    pub fn town_of_heroes(&self, heroes: &[(&str, f64, &str)]) -> Sumo {
+        let (net, _) = self.town();
+        let vehicle = |(id, at_m, edges): &(&str, f64, &str)| {
+            format!("<vehicle id=\"{id}\" depart=\"0\" departPos=\"{at_m}\"><route edges=\"{edges}\"/></vehicle>")
+        };
+        let vehicles: String = heroes.iter().map(vehicle).collect();
+        self.file("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
+        let scenario = self.file(
+            "a.sumocfg",
+            "<configuration><input><net-file value=\"town.net.xml\"/><route-files value=\"a.rou.xml\"/></input></configuration>",
+        );
+        let options = SumoOptions::scenario(
+            &sumo_home(),
+            &scenario,
+            &own_options(&net, &["a.rou.xml"]),
+            &self.folder.path().join("sumo"),
+            0.1,
+            23423,
+            ConnectedRule::Scenario {
+                heroes: heroes.iter().map(|(id, ..)| (*id).to_owned()).collect(),
+                cav_share: 0.0,
+                max_cavs: 0,
+            },
+        );
+        Sumo::start(options.unwrap()).unwrap()
+    }
+
     /// The project's own town, built from its sources, and its additional files.
     pub fn town(&self) -> (PathBuf, Vec<PathBuf>) {
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/town");
