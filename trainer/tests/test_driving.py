@@ -56,6 +56,13 @@ def test_the_order_of_a_groups_members_does_not_matter_and_their_number_is_that_
         GroupedNetwork(16, 2, (16,))
 
 
+@pytest.mark.parametrize("ticks", [1, 3])
+def test_a_tick_without_heroes_has_no_actions(ticks: int) -> None:
+    net = GroupedNetwork(ticks * FIELDS, 2, (16,))
+    assert net(torch.zeros(0, ticks * FIELDS)).shape == (0, 2)
+    assert net(torch.zeros(5, ticks * FIELDS)).shape == (5, 2)
+
+
 def test_members_are_encoded_beside_what_the_hero_itself_does() -> None:
     net, rows = network(), torch.rand(4, FIELDS) * 2 - 1
     with torch.no_grad():

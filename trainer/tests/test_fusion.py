@@ -225,6 +225,21 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     assert channel.committed_up_to == 2 * 40 - 1
 
 
+def test_an_episode_without_a_tick_that_counts_teaches_nothing(tmp_path: Path) -> None:
+    """As where the first vehicles of a scenario depart after its first episode."""
+    run = street_run(tmp_path)
+    ticks = (
+        replace(obs, valid=np.zeros_like(obs.valid)) if obs.episode == 0 else obs
+        for obs in street_ticks(run, episodes=2)
+    )
+    config, learner, beginning = begin(run, SIZE, Continuation())
+    channel = SyntheticChannel(run, ticks)
+    assert FusionLoop(channel, config, learner, beginning, lambda: False).run()
+    part = json.loads((tmp_path / "parts" / "trainer.json").read_text())
+    assert (part["updates"], part["lost_ticks"], part["duplicated_ticks"]) == (1, 0, 0)
+    assert channel.committed_up_to == 2 * 40 - 1
+
+
 def test_a_full_disk_is_waited_for_and_a_stop_ends_the_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run_it(folder: Path, stop_requested: Callable[[], bool]) -> SyntheticChannel:
         run = street_run(folder, checkpoint_interval=1)

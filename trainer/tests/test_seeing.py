@@ -154,6 +154,17 @@ def test_stacks_of_a_horizon_are_those_of_the_ticks_as_they_come(horizon: int) -
     assert compared == len(expected) > 150
 
 
+def test_a_tick_without_vehicles_has_no_stacks_and_those_after_it_begin_there() -> None:
+    history = FrameHistory(TrainerConfig.from_run(seeing_run("x", **TOY)))
+    (first, second) = street_ticks(2, 2, 0.0, seed=1)
+    names = ("observation", "truth", "gnss_m", "vehicle", "valid", "terminated", "truncated")
+    nothing = replace(first, **{name: getattr(first, name)[:0] for name in names})
+    none = history.stacks(seen(nothing, torch.zeros(0, *SHAPE.size, dtype=torch.uint8)))
+    assert none.of(torch.arange(0)).shape == (0, FRAMES * SHAPE.size[0], *SHAPE.size[1:])
+    images = torch.full((2, *SHAPE.size), 7, dtype=torch.uint8)
+    assert history.stacks(seen(second, images)).of(torch.arange(2))[:, :, 0, 0].tolist() == [[7, 7, 7]] * 2
+
+
 def test_a_trajectory_s_first_image_stands_for_those_before_it() -> None:
     config = TrainerConfig.from_run(seeing_run("x", **TOY))
     history, ticks = FrameHistory(config), []

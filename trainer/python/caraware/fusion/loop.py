@@ -185,6 +185,13 @@ class FusionLoop:
     def _learn(self, obs: Observation) -> None:
         """Learn from the episode that ends with this tick."""
         episode, self._recording = self._recording.episode(), Recording()
+        if not episode.valid.any():
+            log.warning(
+                "episode %d had no tick that counts, and nothing is learned from it: its vehicles came too late for "
+                "their filters to begin",
+                obs.episode,
+            )
+            return
         try:
             stats = self._learner.learn(episode, self._config.progress(obs.episode), self._stop_requested)
         except NonFiniteLoss as error:

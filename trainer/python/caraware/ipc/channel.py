@@ -379,6 +379,8 @@ class _Answer(NamedTuple):
 
     observation: Observation
     rows: bytes
+    columns: int
+    """Also of a tick without vehicles, which has no rows."""
     policy_version: int
     sent_s: float
 
@@ -581,14 +583,13 @@ class Channel:
         expected = (observation.block.slots, setting(self.run, "v2x.candidates", int) if speaks else 2)
         if rows.shape != expected:
             raise ValueError(f"actions of shape {rows.shape}, the task takes {expected}")
-        self._answer = _Answer(observation, rows.tobytes(), policy_version, time.monotonic())
+        self._answer = _Answer(observation, rows.tobytes(), rows.shape[1], policy_version, time.monotonic())
         if now:
             self._send(self._answer)
 
     def _send(self, answer: _Answer) -> None:
         block = answer.observation.block
-        columns = len(answer.rows) // max(1, block.slots * np.dtype(np.float32).itemsize)
-        self._attachment.publish_predictions(block, answer.rows, columns, answer.policy_version)
+        self._attachment.publish_predictions(block, answer.rows, answer.columns, answer.policy_version)
 
     def _answer_again(self, answer: _Answer) -> None:
         """Send the newest actions again if no tick has come for long: a simulator that died may have lost them."""

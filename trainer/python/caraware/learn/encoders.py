@@ -98,7 +98,7 @@ class GroupedNetwork(nn.Module):
             encoded.append(encoder(members, ego))
             at += width
         seen = torch.cat(encoded, 1).relu()
-        out: Tensor = self.trunk(seen.view(len(rows), -1))
+        out: Tensor = self.trunk(seen.view(len(rows), self.ticks * seen.shape[1]))
         return out
 
 

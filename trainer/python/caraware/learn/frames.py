@@ -38,7 +38,9 @@ class Stacks(NamedTuple):
     def of(self, rows: Tensor) -> Tensor:
         """u8 `[r, frames * channels, height, width]`: those of some rows, a copy."""
         places = self.places[rows]
-        return self.frames.index_select(0, places.flatten()).view(len(rows), -1, *self.frames.shape[2:])
+        # No size is left to be deduced: a tick without vehicles has none of its numbers.
+        channels = places.shape[1] * self.frames.shape[1]
+        return self.frames.index_select(0, places.flatten()).view(len(rows), channels, *self.frames.shape[2:])
 
 
 @dataclass(frozen=True)
