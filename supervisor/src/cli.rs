@@ -655,6 +655,9 @@ pub struct DiffArgs {
 pub struct RunArgs {
     /// Preset name, .toml file, or .sumocfg file [default: town]
     pub config: Option<String>,
+    /// Preset that a .toml or a .sumocfg begins from [default: the `preset` of the .toml, or town]
+    #[arg(long, value_name = "NAME", requires = "config")]
+    pub preset: Option<String>,
     /// Change one setting, e.g. --set traffic.cavs=8 (repeatable; see configs/README.md)
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,

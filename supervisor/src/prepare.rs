@@ -269,6 +269,7 @@ pub(crate) fn prepare_in_new_directory(
 fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Exit> {
     let name = args.config.as_deref().unwrap_or("town");
     let path = Path::new(name);
+    let preset = args.preset.as_deref();
     let defaults = LayeredSettings::defaults()?;
     let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned());
     let label = stem
@@ -277,7 +278,11 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
         .to_owned();
     match path.extension().and_then(std::ffi::OsStr::to_str) {
         _ if scenario::is_scenario(path) => {
-            let mut settings = defaults.with_assignments(&args.set)?;
+            let settings = match preset {
+                Some(preset) => defaults.with_named_preset(preset)?,
+                None => defaults,
+            };
+            let mut settings = settings.with_assignments(&args.set)?;
             let host = settings.text("traffic.traci_host").unwrap_or_default();
             let reading = ScenarioReading::of(settings.has_flag(TRUST_KEY), host);
             let scenario = scenario::read(path, reading)?;
@@ -287,12 +292,16 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
             Ok((settings, TrafficInput::Scenario(path, scenario), label))
         }
         Some("toml") => {
-            let mut settings = defaults.with_file(path)?.with_assignments(&args.set)?;
+            let mut settings = defaults.with_file(path, preset)?.with_assignments(&args.set)?;
             if settings.is_set_by_user("curriculum.maps") {
                 suggest_preview(&mut settings, name);
             }
             Ok((settings, TrafficInput::Map, label))
         }
+        _ if preset.is_some() => Err(Exit::config(
+            format!("`--preset` is for a .toml or a .sumocfg, and CONFIG is {name}"),
+            "leave one of both out",
+        )),
         _ => {
             let settings = defaults.with_preset(name).ok_or_else(|| ConfigError::File {
                 path: name.to_owned(),

@@ -35,6 +35,11 @@ pub fn apply(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &s
         }
         settings.suggest(path, Value::from(none), source);
     }
+    // What a preset says of maps and of heroes on them. From a user it is refused later, with the keys that a scenario has for it.
+    settings.suggest("traffic.heroes", Value::from(0), source);
+    settings.suggest("traffic.hero_route", Value::Array(Vec::new()), source);
+    settings.suggest("curriculum.maps", Value::Array(Vec::new()), source);
+    settings.suggest("curriculum.stages", Value::Array(Vec::new()), source);
     settings.suggest("traffic.step_s", Value::from(scenario.own.step_s), source);
     settings.suggest("run.seed", Value::from(scenario.own.seed), source);
     settings.suggest("traffic.max_road_users", Value::from(ROAD_USERS), source);

@@ -4,6 +4,7 @@ use miette::{Diagnostic, LabeledSpan, Severity, SourceCode};
 
 use super::{
     keys::{self, ConfigKey},
+    layer::PRESET_KEY,
     span::SourceSpan,
 };
 
@@ -100,6 +101,12 @@ impl ConfigError {
     fn advice(&self) -> String {
         match self {
             Self::Syntax { .. } => "see https://toml.io for the format".into(),
+            Self::UnknownKey { path, .. } if path == PRESET_KEY => {
+                "a .toml may name its preset above its first section; on the command line give --preset NAME".into()
+            }
+            Self::UnknownKey { path, .. } if path.ends_with(".preset") => {
+                "`preset` stands above the first section of a file, where TOML has the keys without one".into()
+            }
             Self::UnknownKey {
                 nearest: Some(nearest), ..
             } => format!("did you mean `{nearest}`? All keys: configs/README.md"),

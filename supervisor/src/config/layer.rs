@@ -32,6 +32,18 @@ pub struct LocatedValue {
     pub entries: Vec<SettingsLayer>,
 }
 
+/// The key of a user's file that names the preset that the file begins from. It stands above the first section.
+pub const PRESET_KEY: &str = "preset";
+
+/// The preset that a file begins from.
+#[derive(Debug, Clone)]
+pub struct PresetChoice {
+    /// Its name as written; `None` if the value is no text.
+    pub name: Option<String>,
+    /// Where it is named.
+    pub place: SourceSpan,
+}
+
 /// Settings by dotted path.
 pub type SettingsLayer = BTreeMap<&'static str, LocatedValue>;
 
@@ -40,6 +52,31 @@ pub type SettingsLayer = BTreeMap<&'static str, LocatedValue>;
 /// # Errors
 /// The text is not TOML, a key is unknown, or a value has a wrong type or is out of range. Each error has its line.
 pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
+    let (source, table) = table_of(name, text)?;
+    let mut layer = SettingsLayer::new();
+    add_table("", &table, &source, &mut layer)?;
+    Ok(layer)
+}
+
+/// Reads a user's file: its settings, and the preset that it begins from, if it names one with [`PRESET_KEY`].
+///
+/// # Errors
+/// As [`parse`], or the preset is no text.
+pub fn parse_file(name: &str, text: &str) -> Result<(Option<PresetChoice>, SettingsLayer), ConfigError> {
+    let (source, mut table) = table_of(name, text)?;
+    let preset = table.remove(PRESET_KEY).map(|value| PresetChoice {
+        name: value.get_ref().as_str().map(ToOwned::to_owned),
+        place: SourceSpan {
+            source: source.clone(),
+            span: value.span(),
+        },
+    });
+    let mut layer = SettingsLayer::new();
+    add_table("", &table, &source, &mut layer)?;
+    Ok((preset, layer))
+}
+
+fn table_of<'a>(name: &str, text: &'a str) -> Result<(NamedText, DeTable<'a>), ConfigError> {
     let source: NamedText = Arc::new(NamedSource::new(name, text.to_owned()).with_language("toml"));
     let table = DeTable::parse(text).map_err(|error| ConfigError::Syntax {
         message: error.message().to_owned(),
@@ -48,9 +85,7 @@ pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
             span: error.span().unwrap_or(0..0),
         },
     })?;
-    let mut layer = SettingsLayer::new();
-    add_table("", table.get_ref(), &source, &mut layer)?;
-    Ok(layer)
+    Ok((source, table.into_inner()))
 }
 
 /// Reads one `key=value` of the command line; a bare word counts as text.

@@ -15,7 +15,7 @@ use serde_json::{Map, Value};
 
 use crate::scenario::input_check::require_regular;
 pub use error::ConfigError;
-use layer::{LocatedValue, SettingsLayer};
+use layer::{LocatedValue, PresetChoice, SettingsLayer};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
 pub const PRESETS: [(&str, &str); 8] = [
@@ -60,11 +60,11 @@ impl LayeredSettings {
         }))
     }
 
-    /// Adds a user's TOML file.
+    /// Adds a user's TOML file, and before it the preset `preset`, or the one that the file names.
     ///
     /// # Errors
-    /// The file is unreadable, or as [`layer::parse`].
-    pub fn with_file(mut self, path: &Path) -> Result<Self, ConfigError> {
+    /// The file is unreadable, there is no such preset, or as [`layer::parse`].
+    pub fn with_file(self, path: &Path, preset: Option<&str>) -> Result<Self, ConfigError> {
         let name = path.display().to_string();
         let unreadable = |reason: String| ConfigError::File {
             path: name.clone(),
@@ -73,8 +73,35 @@ impl LayeredSettings {
         };
         require_regular(path).map_err(unreadable)?;
         let text = std::fs::read_to_string(path).map_err(|error| unreadable(error.to_string()))?;
-        self.0.extend(layer::parse(&name, &text)?);
-        Ok(self)
+        let (named, layer) = layer::parse_file(&name, &text)?;
+        let mut settings = match (preset, named) {
+            (Some(preset), _) => self.with_named_preset(preset)?,
+            (None, Some(named)) => self.with_choice(&named)?,
+            (None, None) => self,
+        };
+        settings.0.extend(layer);
+        Ok(settings)
+    }
+
+    /// Adds the preset `--preset`.
+    ///
+    /// # Errors
+    /// There is no such preset.
+    pub fn with_named_preset(self, name: &str) -> Result<Self, ConfigError> {
+        self.with_preset(name).ok_or_else(|| ConfigError::File {
+            path: format!("--preset {name}"),
+            message: "there is no such preset".into(),
+            help: format!("presets: {}", preset_names()),
+        })?
+    }
+
+    fn with_choice(self, choice: &PresetChoice) -> Result<Self, ConfigError> {
+        let name = choice.name.as_deref().unwrap_or_default();
+        self.with_preset(name).ok_or_else(|| ConfigError::Conflict {
+            message: format!("there is no preset {}", choice.place.text()),
+            help: format!("presets: {}", preset_names()),
+            place: choice.place.clone(),
+        })?
     }
 
     /// Adds `--set` assignments, in order.

@@ -80,6 +80,59 @@ fn an_unknown_key_is_refused_with_file_line_and_the_nearest_key() {
     assert_eq!(help, "did you mean `gnss.noise_std_deg`? All keys: configs/README.md");
 }
 
+/// A file that begins from a preset.
+fn file_of(text: &str, preset: Option<&str>) -> Result<Config, ConfigError> {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("my.toml");
+    std::fs::write(&path, text).unwrap();
+    LayeredSettings::defaults()?.with_file(&path, preset)?.validate()
+}
+
+#[test]
+fn a_file_begins_from_the_preset_that_it_names() {
+    let driving = |name: &str| LayeredSettings::defaults().unwrap().with_preset(name).unwrap().unwrap();
+    let mut expected = driving("driving").validate().unwrap();
+    assert_eq!(file_of("preset = \"driving\"\n", None).unwrap(), expected);
+    // The option has precedence, and the file's own settings before both.
+    expected.traffic.heroes = 4;
+    for (text, preset) in [
+        ("preset = 'driving'\n[traffic]\nheroes = 4\n", None),
+        ("preset = \"lap\"\n[traffic]\nheroes = 4\n", Some("driving")),
+        ("traffic.heroes = 4\n", Some("driving")),
+    ] {
+        assert_eq!(file_of(text, preset).unwrap(), expected, "{text}");
+    }
+    assert_eq!(
+        file_of("", None).unwrap(),
+        LayeredSettings::defaults().unwrap().validate().unwrap()
+    );
+}
+
+#[test]
+fn a_preset_that_is_none_is_refused_with_its_line_and_the_names_of_all() {
+    let refusal = |error: &ConfigError| (error.to_string(), miette::Diagnostic::help(error).unwrap().to_string());
+    for value in ["\"drivign\"", "3"] {
+        let (message, help) = refusal(&file_of(&format!("# mine\npreset = {value}\n"), None).unwrap_err());
+        assert!(
+            message.ends_with(&format!("my.toml:2: there is no preset {value}")),
+            "{message}"
+        );
+        assert!(help.starts_with("presets: town, paper, driving"), "{help}");
+    }
+    let (message, help) = refusal(&file_of("", Some("drivign")).unwrap_err());
+    assert_eq!(message, "--preset drivign: there is no such preset");
+    assert!(help.starts_with("presets: town, paper, driving"), "{help}");
+    // Below a section the key is that section's, and `--set` is no file.
+    let (message, help) = refusal(&file_of("[traffic]\ncavs = 4\npreset = \"driving\"\n", None).unwrap_err());
+    assert!(
+        message.ends_with("my.toml:3: unknown key `traffic.preset`"),
+        "{message}"
+    );
+    assert!(help.contains("above the first section"), "{help}");
+    let (_, help) = refusal(&layer::parse_assignment("preset=driving").unwrap_err());
+    assert!(help.contains("--preset NAME"), "{help}");
+}
+
 #[test]
 fn a_renamed_key_is_refused_with_its_new_name() {
     let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\n");
@@ -374,8 +427,18 @@ mod reference {
 
 `caraware train`, `caraware simulate` and `caraware play` take a CONFIG: the name of a preset, your
 own `.toml`, or a `.sumocfg`. A `.toml` needs only the keys that differ from the default preset
-[`town`](town.toml); `--set key=value` (repeatable) comes last. Every run writes its resolved
-configuration to `config.toml` in its run directory, which is a valid CONFIG too.
+[`town`](town.toml), or from the preset that it names above its first section:
+
+```toml
+preset = \"driving\"
+
+[traffic]
+heroes = 4
+```
+
+`--preset NAME` does the same on the command line, for a `.sumocfg` too. `--set key=value`
+(repeatable) comes last. Every run writes its resolved configuration to `config.toml` in its run
+directory, which is a valid CONFIG too.
 
 Units are SI with angles in radians, except where a key's name says degrees. An unknown key, a wrong
 type or a value out of range is refused with the file, the line and the allowed values.

@@ -187,6 +187,21 @@ fn unknown_preset() {
 }
 
 #[test]
+fn preset_of_a_preset_and_of_nothing() {
+    let workplace = Workplace::new();
+    let said = refused(&workplace, &["train", "lap", "--preset", "driving"], 2);
+    assert_says(
+        &said,
+        &["`--preset` is for a .toml or a .sumocfg", "CONFIG is lap", "leave one"],
+    );
+    let said = refused(&workplace, &["train", "--preset", "driving"], 2);
+    assert_says(
+        &said,
+        &["required arguments were not provided", "--preset <NAME> <CONFIG>"],
+    );
+}
+
+#[test]
 fn missing_sumocfg() {
     let workplace = Workplace::new();
     assert_says(

@@ -163,7 +163,7 @@ fn damaged_configurations_are_read_or_refused() {
     for preset in ["town", "paper", "fusion"] {
         let original = std::fs::read(Path::new("../configs").join(preset).with_extension("toml")).unwrap();
         each_damaged(&original, &path, 60, || {
-            let settings = LayeredSettings::defaults().unwrap().with_file(&path);
+            let settings = LayeredSettings::defaults().unwrap().with_file(&path, None);
             match settings.and_then(|settings| settings.validate()) {
                 Ok(_) => read += 1,
                 Err(error) => {

@@ -3,7 +3,8 @@
 use std::{path::PathBuf, process::Output};
 
 use crate::common::{BARE_NET_SETTINGS, Workplace, sumo_program, text, tool};
-use ipc_schema::run::VEHICLE_IDS;
+use caraware::config::{LayeredSettings, PRESETS};
+use ipc_schema::run::{RunFile, VEHICLE_IDS};
 use serde_json::Value;
 
 /// A grid, and cars on it that depart in the first ten seconds.
@@ -49,6 +50,68 @@ fn simulate(workplace: &Workplace, sumocfg: &str, name: &str, more: &[&str]) -> 
 /// Records of persons in vehicles.
 fn riders(fcd: &str) -> usize {
     fcd.matches(" vehicle=\"").count() - fcd.matches(" vehicle=\"\"").count()
+}
+
+/// What presets say of maps and their traffic does not hold for a scenario, the rest does. Vehicles depart late, so the first ticks have
+/// none.
+#[test]
+fn a_trainer_learns_from_a_scenario_with_any_preset() {
+    let workplace = Workplace::new();
+    grid(&workplace);
+    workplace.write(
+        "cars.rou.xml",
+        "<routes><trip id=\"a\" depart=\"1.5\" from=\"A0A1\" to=\"B2C2\"/><trip id=\"b\" depart=\"1.5\" from=\"A1B1\" to=\"B2C2\"/></routes>",
+    );
+    scenario(
+        &workplace,
+        "late.sumocfg",
+        &format!("{INPUT}<end value=\"8\"/><step-length value=\"0.1\"/>"),
+    );
+    let small = [
+        "episode.training_episodes=1",
+        "episode.ticks=30",
+        "episode.evaluation_ticks=20",
+        "episode.final_evaluations=1",
+        "trainer.plots=false",
+    ];
+    for (preset, _) in PRESETS {
+        let hero = match preset {
+            "driving" | "lap" => Some("traffic.hero_ids=[\"a\"]"),
+            _ => None,
+        };
+        let settings = small.into_iter().chain(hero).flat_map(|setting| ["--set", setting]);
+        let arguments: Vec<&str> = ["train", "late.sumocfg", "--preset", preset, "--name", preset]
+            .into_iter()
+            .chain(settings)
+            .chain(BARE_NET_SETTINGS)
+            .collect();
+        workplace.succeed(&arguments);
+        let report = workplace.report(preset);
+        // A script does not count what it has lost.
+        let lost = report["lost_ticks"].as_u64().unwrap_or(0);
+        assert_eq!(
+            (&report["result"], lost),
+            (&"completed".into(), 0),
+            "{preset}: {report:#}"
+        );
+        // What belongs to the preset alone is that of the preset.
+        let run = RunFile::read(&workplace.path().join("runs").join(preset).join("run.json")).unwrap();
+        let settings = LayeredSettings::defaults().unwrap().with_named_preset(preset).unwrap();
+        let is_observed = |field: &Value| {
+            run.config
+                .observation
+                .fields
+                .iter()
+                .any(|observed| field == observed.name())
+        };
+        let fields = settings.value("observation.fields");
+        assert!(fields.as_array().unwrap().iter().all(is_observed), "{preset}: {fields}");
+        assert_eq!(
+            Some(run.config.trainer.module.as_str()),
+            settings.text("trainer.module"),
+            "{preset}"
+        );
+    }
 }
 
 #[test]

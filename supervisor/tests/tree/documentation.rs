@@ -217,7 +217,9 @@ fn validated(run: &RunArgs) -> Result<(), String> {
     let text = |error: ConfigError| format!("{:?}", miette::Report::new(error));
     let run = run.with_shorthands().map_err(|error| format!("{error:?}"))?;
     let mut settings = LayeredSettings::defaults().map_err(text)?;
-    if let Some(config) = &run.config {
+    if let Some(preset) = &run.preset {
+        settings = settings.with_named_preset(preset).map_err(text)?;
+    } else if let Some(config) = &run.config {
         match settings.clone().with_preset(config) {
             Some(preset) => settings = preset.map_err(text)?,
             None if config.contains('.') || config == "CONFIG" || config == "SCENARIO" => {}
@@ -249,7 +251,7 @@ fn every_configuration_is_valid() {
             }
             count += 1;
             std::fs::write(&file, std::mem::take(&mut block)).unwrap();
-            let settings = LayeredSettings::defaults().and_then(|settings| settings.with_file(&file));
+            let settings = LayeredSettings::defaults().and_then(|settings| settings.with_file(&file, None));
             if let Err(error) = settings.and_then(|settings| settings.validate()) {
                 let why = miette::Report::new(error);
                 refused.push(format!("{}:{begin}: {why:?}", page.path.display()));
