@@ -625,10 +625,14 @@ impl LiveRun {
 struct Counter(Child);
 
 impl Counter {
+    /// It looks now and then whether this program is there, and ends if that was killed.
+    const PROGRAM: &str =
+        "while kill -0 $PPID 2>/dev/null; do i=0; while [ $i -lt 1000000 ]; do i=$((i + 1)); done; done";
+
     fn start() -> Result<Self, Exit> {
         let shell = Path::new("/bin/sh");
         let child = Command::new(shell)
-            .args(["-c", "while :; do :; done"])
+            .args(["-c", Self::PROGRAM])
             .stdin(Stdio::null())
             .spawn();
         child.map(Self).map_err(|error| Exit::io("start", shell, &error))
