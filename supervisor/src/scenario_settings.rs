@@ -35,7 +35,7 @@ pub fn apply(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &s
         }
         settings.suggest(path, Value::from(none), source);
     }
-    // What a preset says of maps and of heroes on them. From a user it is refused later, with the keys that a scenario has for it.
+    // A preset's maps, stages and heroes. Those of a user are refused later, with the keys that a scenario has for them.
     settings.suggest("traffic.heroes", Value::from(0), source);
     settings.suggest("traffic.hero_route", Value::Array(Vec::new()), source);
     settings.suggest("curriculum.maps", Value::Array(Vec::new()), source);

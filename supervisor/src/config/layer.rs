@@ -61,7 +61,7 @@ pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
 /// Reads a user's file: its settings, and the preset that it begins from, if it names one with [`PRESET_KEY`].
 ///
 /// # Errors
-/// As [`parse`], or the preset is no text.
+/// As [`parse`]. Whether there is such a preset is not checked here.
 pub fn parse_file(name: &str, text: &str) -> Result<(Option<PresetChoice>, SettingsLayer), ConfigError> {
     let (source, mut table) = table_of(name, text)?;
     let preset = table.remove(PRESET_KEY).map(|value| PresetChoice {

@@ -90,8 +90,8 @@ fn file_of(text: &str, preset: Option<&str>) -> Result<Config, ConfigError> {
 
 #[test]
 fn a_file_begins_from_the_preset_that_it_names() {
-    let driving = |name: &str| LayeredSettings::defaults().unwrap().with_preset(name).unwrap().unwrap();
-    let mut expected = driving("driving").validate().unwrap();
+    let driving = LayeredSettings::defaults().unwrap().with_named_preset("driving");
+    let mut expected = driving.unwrap().validate().unwrap();
     assert_eq!(file_of("preset = \"driving\"\n", None).unwrap(), expected);
     // The option has precedence, and the file's own settings before both.
     expected.traffic.heroes = 4;
@@ -436,9 +436,10 @@ preset = \"driving\"
 heroes = 4
 ```
 
-`--preset NAME` does the same on the command line, for a `.sumocfg` too. `--set key=value`
-(repeatable) comes last. Every run writes its resolved configuration to `config.toml` in its run
-directory, which is a valid CONFIG too.
+`--preset NAME` does the same on the command line, for a `.sumocfg` too, which has its own road
+users: the maps, stages and heroes of the preset do not hold for it. `--set key=value` (repeatable)
+comes last. Every run writes its resolved configuration to `config.toml` in its run directory, which
+is a valid CONFIG too.
 
 Units are SI with angles in radians, except where a key's name says degrees. An unknown key, a wrong
 type or a value out of range is refused with the file, the line and the allowed values.
