@@ -344,6 +344,12 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
             "name the .sumocfg in curriculum.maps and give a preset or .toml as CONFIG: its net then runs with population control",
         ));
     }
+    if named.is_scenario() && !config.curriculum.maps.is_empty() {
+        return Err(Exit::config(
+            "`curriculum.maps` names nets with population control, and a .sumocfg has its own net and vehicles",
+            "leave it out, or name the .sumocfg in it and give a preset or .toml as CONFIG",
+        ));
+    }
     let changes_map =
         !traffic.traffic_lights || traffic.speed_limit_factor != 1.0 || traffic.hero_turns != HeroTurns::Any;
     if named.is_scenario() && changes_map {

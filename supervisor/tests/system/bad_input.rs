@@ -266,6 +266,23 @@ fn route_with_an_unknown_edge() {
     );
 }
 
+#[test]
+fn maps_beside_a_scenario() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    for mode in ["simulate", "train"] {
+        let said = refused(
+            &workplace,
+            &[mode, "grid.sumocfg", "--set", "curriculum.maps=[\"town\"]"],
+            2,
+        );
+        assert_says(
+            &said,
+            &["`curriculum.maps`", "a .sumocfg has its own net", "leave it out"],
+        );
+    }
+}
+
 /// `grid.sumocfg` with another route file.
 fn simulate(workplace: &Workplace, routes: &str, settings: &[&str]) -> String {
     workplace.write(
