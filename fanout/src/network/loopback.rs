@@ -3,8 +3,9 @@
 //! connections of that user and of root: docs/decisions/0063-loopback-is-for-one-user.md.
 
 use std::{
+    collections::HashMap,
     io,
-    net::{SocketAddr, TcpListener as StdTcpListener},
+    net::{IpAddr, SocketAddr, TcpListener as StdTcpListener},
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -16,7 +17,7 @@ use tokio::{
     io::copy_bidirectional_with_sizes,
     net::{TcpListener, TcpStream, UnixStream},
     runtime::Builder,
-    sync::oneshot,
+    sync::{mpsc, oneshot},
     task::{JoinSet, spawn_blocking},
     time::{sleep, timeout},
 };
@@ -27,8 +28,8 @@ use crate::network::access;
 const SEND_BUFFER_BYTES: usize = 65536;
 /// Bytes that are copied at once, towards zenoh and towards the viewer.
 const COPIED_BYTES: (usize, usize) = (4096, 65536);
-/// Threads that look up which user has opened a connection.
-const LOOKUP_THREADS: usize = 2;
+/// Connections whose users one reading of Linux's tables finds.
+const LOOKED_UP_AT_ONCE: usize = 1024;
 /// Pause after Linux has refused a connection, which it does while there are no file handles.
 const PAUSE: Duration = Duration::from_millis(100);
 
@@ -51,7 +52,7 @@ impl LoopbackGate {
         SockRef::from(&listener).set_send_buffer_size(SEND_BUFFER_BYTES)?;
         let runtime = Builder::new_current_thread()
             .enable_all()
-            .max_blocking_threads(LOOKUP_THREADS)
+            .max_blocking_threads(1)
             .build()?;
         let (stop, stopped) = oneshot::channel();
         let socket = socket.to_owned();
@@ -76,12 +77,15 @@ async fn serve(listener: StdTcpListener, socket: PathBuf, mut stopped: oneshot::
         Ok(listener) => listener,
         Err(error) => return tracing::error!(%error, "viewers on this machine cannot connect"),
     };
+    let (questions, asked) = mpsc::channel(LOOKED_UP_AT_ONCE);
+    // It ends with the last of those who ask.
+    tokio::spawn(find_users(asked));
     let mut relays = JoinSet::new();
     let limit = loop {
         tokio::select! {
             accepted = listener.accept() => match accepted {
                 Ok((viewer, peer)) => {
-                    relays.spawn(relay(viewer, peer, socket.clone()));
+                    relays.spawn(relay(viewer, peer, questions.clone(), socket.clone()));
                 }
                 Err(error) => {
                     tracing::debug!(%error, "a connection cannot be accepted");
@@ -100,8 +104,8 @@ async fn serve(listener: StdTcpListener, socket: PathBuf, mut stopped: oneshot::
 }
 
 /// Passes a connection on until one side closes it, if its other end belongs to this program's user.
-async fn relay(mut viewer: TcpStream, peer: SocketAddr, socket: PathBuf) {
-    let refusal = match user_of(&viewer, peer).await {
+async fn relay(mut viewer: TcpStream, peer: SocketAddr, questions: mpsc::Sender<Question>, socket: PathBuf) {
+    let refusal = match user_of(&viewer, peer, questions).await {
         Ok(Some(user)) if may_connect(user) => None,
         Ok(Some(user)) => Some(format!(
             "it belongs to another user of this machine (user id {})",
@@ -128,37 +132,71 @@ fn may_connect(user: Uid) -> bool {
     user.is_root() || user == rustix::process::geteuid()
 }
 
-/// The user that has opened the other end of an established connection; `None` if that end is closed.
-async fn user_of(viewer: &TcpStream, peer: SocketAddr) -> io::Result<Option<Uid>> {
-    viewer.set_nodelay(true)?;
-    let here = viewer.local_addr()?;
-    spawn_blocking(move || find_user(peer, here)).await?
+/// Both ends of a connection, the viewer's first.
+type Ends = [(IpAddr, u16); 2];
+
+/// Which user has opened a connection? `None` if that user has closed it.
+struct Question {
+    ends: Ends,
+    answer: oneshot::Sender<io::Result<Option<Uid>>>,
 }
 
-fn find_user(peer: SocketAddr, here: SocketAddr) -> io::Result<Option<Uid>> {
-    // Only an open socket names its user: one that is closed and still sends, or waits for late packets, is listed as root's.
-    let is_peer = |socket: &TcpNetEntry| {
-        socket.state == TcpState::Established
-            && canonical(socket.local_address) == canonical(peer)
-            && canonical(socket.remote_address) == canonical(here)
-    };
+/// The user that has opened the other end of an established connection; `None` if that end is closed.
+async fn user_of(viewer: &TcpStream, peer: SocketAddr, questions: mpsc::Sender<Question>) -> io::Result<Option<Uid>> {
+    viewer.set_nodelay(true)?;
+    let ends = [canonical(peer), canonical(viewer.local_addr()?)];
+    let (answer, answered) = oneshot::channel();
+    let ended = |_| io::Error::other("nothing looks it up any more");
+    questions.send(Question { ends, answer }).await.map_err(ended)?;
+    answered
+        .await
+        .unwrap_or_else(|_| Err(io::Error::other("the lookup has failed")))
+}
+
+/// Answers questions, all that wait by one reading of Linux's tables, and counts the readings. A reading takes some milliseconds, so a
+/// viewer would wait for long behind a flood of connections that are looked up one by one.
+async fn find_users(mut questions: mpsc::Receiver<Question>) -> usize {
+    let mut readings = 0;
+    let mut waiting = Vec::new();
+    while questions.recv_many(&mut waiting, LOOKED_UP_AT_ONCE).await > 0 {
+        readings += 1;
+        let users = spawn_blocking(users_of_connections)
+            .await
+            .unwrap_or_else(|error| Err(error.into()));
+        for Question { ends, answer } in waiting.drain(..) {
+            let user = match &users {
+                Ok(users) => Ok(users.get(&ends).copied()),
+                Err(error) => Err(io::Error::new(error.kind(), error.to_string())),
+            };
+            // The connection may have ended meanwhile.
+            let _ = answer.send(user);
+        }
+    }
+    readings
+}
+
+/// The user of each established connection's first end.
+fn users_of_connections() -> io::Result<HashMap<Ends, Uid>> {
+    let mut users = HashMap::new();
     // An IPv4 connection may belong to an IPv6 socket.
     for table in [procfs::net::tcp, procfs::net::tcp6] {
         match table() {
-            Ok(sockets) => {
-                if let Some(socket) = sockets.iter().find(|socket| is_peer(socket)) {
-                    return Ok(Some(Uid::from_raw(socket.uid)));
-                }
-            }
+            Ok(sockets) => users.extend(sockets.iter().filter_map(user_of_socket)),
             // A machine without IPv6 has no such table.
             Err(procfs::ProcError::NotFound(_)) => {}
             Err(error) => return Err(io::Error::other(error)),
         }
     }
-    Ok(None)
+    Ok(users)
 }
 
-fn canonical(address: SocketAddr) -> (std::net::IpAddr, u16) {
+/// Only an open socket names its user: one that is closed and still sends, or waits for late packets, is listed as root's.
+fn user_of_socket(socket: &TcpNetEntry) -> Option<(Ends, Uid)> {
+    let ends = [canonical(socket.local_address), canonical(socket.remote_address)];
+    (socket.state == TcpState::Established).then(|| (ends, Uid::from_raw(socket.uid)))
+}
+
+fn canonical(address: SocketAddr) -> (IpAddr, u16) {
     (address.ip().to_canonical(), address.port())
 }
 
@@ -176,8 +214,12 @@ mod tests {
         Some((client, listener.accept().unwrap().0))
     }
 
+    fn ends_of(accepted: &StdTcpStream) -> Ends {
+        [accepted.peer_addr(), accepted.local_addr()].map(|address| canonical(address.unwrap()))
+    }
+
     fn user_at(accepted: &StdTcpStream) -> Option<Uid> {
-        find_user(accepted.peer_addr().unwrap(), accepted.local_addr().unwrap()).unwrap()
+        users_of_connections().unwrap().get(&ends_of(accepted)).copied()
     }
 
     #[test]
@@ -199,6 +241,31 @@ mod tests {
         let (client, accepted) = connected("127.0.0.1", "127.0.0.1").unwrap();
         drop(client);
         assert_eq!(user_at(&accepted), None);
+    }
+
+    #[test]
+    fn one_reading_answers_all_who_wait() {
+        let (client, accepted) = connected("127.0.0.1", "127.0.0.1").unwrap();
+        let (closed, left) = connected("127.0.0.1", "127.0.0.1").unwrap();
+        drop(closed);
+        let (questions, asked) = mpsc::channel(LOOKED_UP_AT_ONCE);
+        let ask = |accepted: &StdTcpStream| {
+            let (answer, answered) = oneshot::channel();
+            let ends = ends_of(accepted);
+            questions.try_send(Question { ends, answer }).ok().unwrap();
+            answered
+        };
+        let answers: Vec<_> = (0..LOOKED_UP_AT_ONCE / 2)
+            .flat_map(|_| [ask(&accepted), ask(&left)])
+            .collect();
+        drop(questions);
+        let runtime = Builder::new_current_thread().build().unwrap();
+        assert_eq!(runtime.block_on(find_users(asked)), 1);
+        for (number, mut answer) in answers.into_iter().enumerate() {
+            let user = (number % 2 == 0).then(rustix::process::geteuid);
+            assert_eq!(answer.try_recv().unwrap().unwrap(), user);
+        }
+        drop(client);
     }
 
     #[test]
