@@ -423,15 +423,15 @@ impl RunProcesses {
     pub fn first_not_ready(&self) -> Option<(&'static ProcessSpec, &Environment)> {
         self.members()
             .filter(|(row, environment)| row.is_required(&environment.run))
-            .find(|(row, environment)| self.is_starting(row, environment))
+            .find_map(|(row, environment)| Some((row, self.starting_in(row, environment)?)))
     }
 
-    /// True if the process is not ready; a process of the whole run must be ready in every environment.
-    fn is_starting(&self, row: &ProcessSpec, environment: &Environment) -> bool {
-        let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
+    /// The environment in which the process is not ready; a process of the whole run must be ready in each.
+    fn starting_in<'a>(&'a self, row: &ProcessSpec, environment: &'a Environment) -> Option<&'a Environment> {
+        let starts = |environment: &&Environment| environment.state_of(row.process) == State::Starting;
         match row.scope {
-            ProcessScope::Run => self.environments.iter().any(starts),
-            ProcessScope::Environment => starts(environment),
+            ProcessScope::Run => self.environments.iter().find(starts),
+            ProcessScope::Environment => Some(environment).filter(starts),
         }
     }
 

@@ -578,12 +578,14 @@ impl Supervisor {
                     .join(format!("{}.log", row.process));
                 let name = row.label(&environment.run);
                 let message = format!("{name} was not ready within {} s", environment.run.config.run.ready_s);
-                return Err(Failure::new(FailureKind::Run, message)
-                    .with_help(format!(
-                        "its log is {}; a larger run.ready_s waits for longer",
-                        log.display()
-                    ))
-                    .into());
+                let help = match (row.process, environment.run.env_index) {
+                    (Process::Trainer, index @ 1..) => format!(
+                        "it took no place in environment {index}: a trainer takes one in each \
+                         (`channel.in_environment(i)`, docs/learners.md); one that does not needs a run without --envs"
+                    ),
+                    _ => format!("its log is {}; a larger run.ready_s waits for longer", log.display()),
+                };
+                return Err(Failure::new(FailureKind::Run, message).with_help(help).into());
             }
             Some(_) => {}
         }

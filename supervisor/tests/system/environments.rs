@@ -1,6 +1,7 @@
 //! Several environments in one run: each makes the same observations as alone, and one trainer learns from all.
 
 use std::{
+    collections::BTreeMap,
     path::Path,
     process::{Child, Stdio},
 };
@@ -157,6 +158,65 @@ fn a_restarted_trainer_receives_the_uncommitted_ticks_of_every_environment() {
     for (one, other) in [0, 1].map(|index| (&found["environments"][index], &expected["environments"][index])) {
         assert_eq!(one["observation_hash"], other["observation_hash"]);
         assert!(one["redelivered_ticks"].as_u64().unwrap() > 0, "{one:#}");
+    }
+    workplace.assert_nothing_left();
+}
+
+/// `caraware.study.recording` commits an episode when its file is written, in every environment.
+#[test]
+fn ticks_that_are_written_down_are_the_same_after_a_kill() {
+    let workplace = Workplace::new();
+    let recording = ["--envs", "2", "--set", "trainer.module=caraware.study.recording"];
+    succeed(&workplace, "train", "whole", &recording);
+    let paced = [&recording[..], &["--set", "run.real_time_factor=20"]].concat();
+    let mut live = Live::start(&workplace, "train", "killed", &paced);
+    live.kill(Process::Trainer, 1, 150);
+    let (code, said) = live.end();
+    assert_eq!(code, Some(0), "{said}");
+    let files = |run: &str| -> BTreeMap<String, Vec<u8>> {
+        let run = workplace.path().join("runs").join(run);
+        let mut files = BTreeMap::new();
+        for folder in ["recording", "env-1/recording"] {
+            for entry in std::fs::read_dir(run.join(folder)).unwrap().map(Result::unwrap) {
+                let name = format!("{folder}/{}", entry.file_name().display());
+                files.insert(name, std::fs::read(entry.path()).unwrap());
+            }
+        }
+        files
+    };
+    let (whole, killed) = (files("whole"), files("killed"));
+    assert_eq!(whole.len(), 10, "{:?}", whole.keys());
+    for (name, bytes) in &whole {
+        assert!(killed.get(name) == Some(bytes), "{name} differs: {:?}", killed.keys());
+    }
+    assert_eq!(killed.len(), whole.len(), "{:?}", killed.keys());
+    let report = workplace.report("killed");
+    assert_eq!(report["restarts"], 1, "{report:#}");
+    assert_eq!(report["trainer"]["recorded_episodes"], 10, "{report:#}");
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_trainer_without_a_place_in_every_environment_is_refused_with_the_reason() {
+    let workplace = Workplace::new();
+    let settings = [
+        "--envs",
+        "2",
+        "--set",
+        "trainer.module=caraware.consumer",
+        "--set",
+        "run.ready_s=15",
+    ];
+    let arguments = arguments("train", "one", &settings);
+    let output = workplace.run(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    for part in [
+        "trainer was not ready within 15 s",
+        "no place in environment 1",
+        "without --envs",
+    ] {
+        assert!(said.contains(part), "{part}: {said}");
     }
     workplace.assert_nothing_left();
 }

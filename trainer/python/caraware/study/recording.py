@@ -1,14 +1,15 @@
 """`trainer.module = "caraware.study.recording"`: in the trainer's place, writes down every tick and learns nothing.
 
-`recording/NNNNNN.npz` in the run's directory holds one episode. `Recording` reads it back as the ticks that a learner
-or a filter takes, so that several of them can be compared on the same bytes.
+`recording/NNNNNN.npz` in the run's directory holds one episode, `env-1/recording/NNNNNN.npz` one of the second
+environment. `Recording` reads them back as the ticks that a learner or a filter takes, so that several of them can be
+compared on the same bytes.
 """
 
+import itertools
 import json
 import os
-import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,11 @@ import torch
 from torch import Tensor
 
 from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array, UInt64Array
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.channel import Channel, StreamEndedError
+from caraware.ipc.report_part import write_entries
+from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import EMPTY_SLOT, Observation
+from caraware.run.process import StopSignal
 
 FOLDER = "recording"
 TENSORS = ("observation", "truth", "gnss_m", "imu", "speed_steering")
@@ -131,9 +135,18 @@ class Recording:
         run: RunFile = json.loads((self.run_dir / "run.json").read_text())
         return run
 
+    def files(self) -> list[Path]:
+        """Of every episode of environment 0, then of the next."""
+        by_environment = (sorted(folder.glob("*.npz")) for folder in map(self.folder, itertools.count()))
+        return list(itertools.chain.from_iterable(itertools.takewhile(bool, by_environment)))
+
+    def folder(self, environment: int) -> Path:
+        """Where the episodes of an environment are."""
+        return (self.run_dir / f"env-{environment}" if environment else self.run_dir) / FOLDER
+
     def episodes(self, *, evaluation: bool) -> Iterator[list[RecordedTick]]:
         """Episode by episode, in the run's order: those of evaluations, or those of training."""
-        for file in sorted((self.run_dir / FOLDER).glob("*.npz")):
+        for file in self.files():
             with np.load(file) as stored:
                 if bool(stored["evaluation"][0]) == evaluation:
                     yield _ticks(int(file.stem), {name: stored[name] for name in stored.files})
@@ -149,33 +162,58 @@ def _ticks(episode: int, columns: dict[str, Any]) -> list[RecordedTick]:
     return ticks
 
 
-def main(run_file: str) -> None:
-    """Record one run and write `parts/trainer.json`."""
-    from caraware import _native
-    from caraware.ipc.channel import Observation as SharedObservation
+@dataclass
+class RecordedEnvironment:
+    """One environment of the run: its ticks are committed episode by episode, when their file is written."""
 
-    stop: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda number, _: stop.append(number))
+    channel: Channel
+    writer: EpisodeWriter
+    env_steps: int = 0
+    ticks: int = 0
+    ended: bool = False
+
+    def take(self, stop_requested: Callable[[], bool]) -> None:
+        """Write down what is waiting."""
+        try:
+            observations = self.channel.receive(0.0)
+        except StreamEndedError:
+            self.ended = True
+            return
+        for obs in observations:
+            # The channel's observation has all that is recorded.
+            self.writer.add(obs)
+            self.env_steps, self.ticks = self.env_steps + int(obs.valid.sum()), self.ticks + 1
+            self.channel.consumed(obs.tick)
+            if obs.episode_last or obs.last:
+                self.channel.commit(obs.tick, stop_requested)
+
+
+def main(run_file: str) -> None:
+    """Record one run and write `parts/trainer.json`. A successor continues with the first episode without a file."""
+    stop = StopSignal()
     torch.set_num_threads(1)
-    attachment = _native.Attachment(run_file)
-    run = json.loads(attachment.run_json)
-    run_dir = Path(run["run_dir"])
-    writer = EpisodeWriter(run_dir / FOLDER, has_messages=run["config"]["v2x"]["share"] > 0)
-    env_steps, ticks = 0, 0
-    while not attachment.ended and not stop:
-        for obs in map(SharedObservation, attachment.receive(0.2)):
-            writer.add(obs)
-            env_steps, ticks = env_steps + int(obs.valid.sum()), ticks + 1
-            attachment.committed(obs.tick)
-            attachment.consumed(obs.tick)
+    first = Channel(run_file)
+    channels = [first, *map(first.in_environment, range(1, setting(first.run, "run.envs", int)))]
+    recording = Recording(Path(first.run["run_dir"]))
+    has_messages = setting(first.run, "v2x.share", float) > 0
+    environments = [
+        RecordedEnvironment(channel, EpisodeWriter(recording.folder(index), has_messages))
+        for index, channel in enumerate(channels)
+    ]
+    while not stop.requested:
+        for environment in environments:
+            environment.take(lambda: stop.requested)
+        if all(environment.ended for environment in environments):
+            break
+        first.wait_for_any(0.2)
     part = {
-        "env_steps": env_steps,
-        "received_ticks": ticks,
-        "recorded_episodes": len(list(writer.folder.glob("*.npz"))),
+        "env_steps": sum(environment.env_steps for environment in environments),
+        "received_ticks": sum(environment.ticks for environment in environments),
+        "recorded_episodes": len(recording.files()),
     }
-    (run_dir / "parts" / "trainer.json").write_text(json.dumps(part) + "\n")
-    attachment.done()
+    write_entries(recording.run_dir, part, lambda: stop.requested)
+    for channel in channels:
+        channel.done()
 
 
 if __name__ == "__main__":
