@@ -3,7 +3,7 @@
 //! connections of that user and of root: docs/decisions/0063-loopback-is-for-one-user.md.
 
 use std::{
-    collections::HashMap,
+    collections::BTreeMap,
     io,
     net::{IpAddr, SocketAddr, TcpListener as StdTcpListener},
     path::{Path, PathBuf},
@@ -176,8 +176,8 @@ async fn find_users(mut questions: mpsc::Receiver<Question>) -> usize {
 }
 
 /// The user of each established connection's first end.
-fn users_of_connections() -> io::Result<HashMap<Ends, Uid>> {
-    let mut users = HashMap::new();
+fn users_of_connections() -> io::Result<BTreeMap<Ends, Uid>> {
+    let mut users = BTreeMap::new();
     // An IPv4 connection may belong to an IPv6 socket.
     for table in [procfs::net::tcp, procfs::net::tcp6] {
         match table() {
