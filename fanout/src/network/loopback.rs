@@ -78,7 +78,7 @@ async fn serve(listener: StdTcpListener, socket: PathBuf, mut stopped: oneshot::
         Err(error) => return tracing::error!(%error, "viewers on this machine cannot connect"),
     };
     let (questions, asked) = mpsc::channel(LOOKED_UP_AT_ONCE);
-    // It ends with the last of those who ask.
+    // It ends when nothing can ask any more.
     tokio::spawn(find_users(asked));
     let mut relays = JoinSet::new();
     let limit = loop {
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn one_reading_answers_all_who_wait() {
+    fn one_reading_answers_all_questions_that_wait() {
         let (client, accepted) = connected("127.0.0.1", "127.0.0.1").unwrap();
         let (closed, left) = connected("127.0.0.1", "127.0.0.1").unwrap();
         drop(closed);
