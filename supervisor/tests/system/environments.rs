@@ -74,12 +74,18 @@ impl Live {
         Self { child, node, file }
     }
 
-    /// Kills a process once its environment has consumed or made `ticks`.
-    fn kill(&mut self, process: Process, environment: u32, ticks: u64) {
+    /// Waits until a process has consumed or made `ticks` of an environment; returns its board.
+    fn reach(&mut self, process: Process, environment: u32, ticks: u64) -> BoardReader {
         let board = BoardReader::open(&self.node, &self.file, environment, process).unwrap();
         until(&mut self.child, "ticks", || {
             (board.health().ticks >= ticks).then_some(())
         });
+        board
+    }
+
+    /// Kills a process once its environment has consumed or made `ticks`.
+    fn kill(&mut self, process: Process, environment: u32, ticks: u64) {
+        let board = self.reach(process, environment, ticks);
         kill_process(Pid::from_raw(board.health().pid).unwrap(), Signal::KILL).unwrap();
     }
 
@@ -164,15 +170,10 @@ fn a_restarted_trainer_receives_the_uncommitted_ticks_of_every_environment() {
 
 /// `caraware.study.recording` commits an episode when its file is written, in every environment.
 #[test]
-fn ticks_that_are_written_down_are_the_same_after_a_kill() {
+fn ticks_that_are_written_down_are_the_same_after_a_kill_and_a_handover() {
     let workplace = Workplace::new();
     let recording = ["--envs", "2", "--set", "trainer.module=caraware.study.recording"];
     succeed(&workplace, "train", "whole", &recording);
-    let paced = [&recording[..], &["--set", "run.real_time_factor=20"]].concat();
-    let mut live = Live::start(&workplace, "train", "killed", &paced);
-    live.kill(Process::Trainer, 1, 150);
-    let (code, said) = live.end();
-    assert_eq!(code, Some(0), "{said}");
     let files = |run: &str| -> BTreeMap<String, Vec<u8>> {
         let run = workplace.path().join("runs").join(run);
         let mut files = BTreeMap::new();
@@ -184,15 +185,33 @@ fn ticks_that_are_written_down_are_the_same_after_a_kill() {
         }
         files
     };
-    let (whole, killed) = (files("whole"), files("killed"));
+    let whole = files("whole");
     assert_eq!(whole.len(), 10, "{:?}", whole.keys());
-    for (name, bytes) in &whole {
-        assert!(killed.get(name) == Some(bytes), "{name} differs: {:?}", killed.keys());
+    // A run lasts 40 s at the pace of real time, and a busy machine takes ten for a successor to start.
+    for (name, pace) in [
+        ("killed", "run.real_time_factor=20"),
+        ("replaced", "run.real_time_factor=1"),
+    ] {
+        let paced = [&recording[..], &["--set", pace]].concat();
+        let mut live = Live::start(&workplace, "train", name, &paced);
+        if name == "killed" {
+            live.kill(Process::Trainer, 1, 150);
+        } else {
+            live.reach(Process::Trainer, 1, 30);
+            workplace.succeed(&["handover", name]);
+        }
+        let (code, said) = live.end();
+        assert_eq!(code, Some(0), "{said}");
+        let found = files(name);
+        assert!(found.keys().eq(whole.keys()), "{name}: {:?}", found.keys());
+        let differing: Vec<&String> = whole.keys().filter(|file| found[*file] != whole[*file]).collect();
+        assert!(differing.is_empty(), "{name}: {differing:?}");
+        let report = workplace.report(name);
+        let handovers = report["handovers"].as_array().map_or(0, Vec::len);
+        let counts = if name == "killed" { (1, 0) } else { (0, 1) };
+        assert_eq!((report["restarts"].as_u64().unwrap(), handovers), counts, "{report:#}");
+        assert_eq!(report["trainer"]["recorded_episodes"], 10, "{report:#}");
     }
-    assert_eq!(killed.len(), whole.len(), "{:?}", killed.keys());
-    let report = workplace.report("killed");
-    assert_eq!(report["restarts"], 1, "{report:#}");
-    assert_eq!(report["trainer"]["recorded_episodes"], 10, "{report:#}");
     workplace.assert_nothing_left();
 }
 

@@ -23,7 +23,7 @@ from caraware.ipc.channel import Channel, StreamEndedError
 from caraware.ipc.report_part import write_entries
 from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import EMPTY_SLOT, Observation
-from caraware.run.process import StopSignal
+from caraware.run.process import HandoverRole, StopSignal, run_process
 
 FOLDER = "recording"
 TENSORS = ("observation", "truth", "gnss_m", "imu", "speed_steering")
@@ -188,11 +188,12 @@ class RecordedEnvironment:
                 self.channel.commit(obs.tick, stop_requested)
 
 
-def main(run_file: str) -> None:
+def record(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     """Record one run and write `parts/trainer.json`. A successor continues with the first episode without a file."""
-    stop = StopSignal()
+    if role.gets_ready and not role.wait_for_turn():
+        return
     torch.set_num_threads(1)
-    first = Channel(run_file)
+    first = Channel(str(run_file))
     channels = [first, *map(first.in_environment, range(1, setting(first.run, "run.envs", int)))]
     recording = Recording(Path(first.run["run_dir"]))
     has_messages = setting(first.run, "v2x.share", float) > 0
@@ -200,11 +201,12 @@ def main(run_file: str) -> None:
         RecordedEnvironment(channel, EpisodeWriter(recording.folder(index), has_messages))
         for index, channel in enumerate(channels)
     ]
-    while not stop.requested:
+    while not all(environment.ended for environment in environments) and not stop.requested:
+        if stop.leave_requested:
+            # The ticks of unfinished episodes come again to the successor.
+            return
         for environment in environments:
             environment.take(lambda: stop.requested)
-        if all(environment.ended for environment in environments):
-            break
         first.wait_for_any(0.2)
     part = {
         "env_steps": sum(environment.env_steps for environment in environments),
@@ -217,6 +219,6 @@ def main(run_file: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    code = run_process(sys.argv[1:], record)
     # torch would take a while to tidy up, and the run ends when this process does.
-    os._exit(0)
+    os._exit(code)
