@@ -178,7 +178,7 @@ impl RunMembership {
             storage::retry_on_full_disk(|| wakes.listener_builder().create()).map_err(|e| PortError::Refused {
                 channel: "wake",
                 action: "creation of the listener",
-                reason: format!("{e:?}"),
+                reason: storage::reason_of(&e),
             })?;
         Self::take_place(run, process, env_index, stop, node, Arc::new(wake))
     }

@@ -20,7 +20,7 @@ use crate::{
     reserve::{MessagePages, ReserveError},
     run::RunFile,
     services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
-    storage::retry_on_full_disk,
+    storage::{reason_of, retry_on_full_disk},
 };
 
 pub use crate::{
@@ -82,7 +82,7 @@ pub(crate) fn refused(channel: &'static str, action: &'static str) -> impl FnOnc
     move |reason| PortError::Refused {
         channel,
         action,
-        reason: format!("{reason:?}"),
+        reason: reason_of(reason),
     }
 }
 

@@ -32,7 +32,7 @@ use crate::{
     process::{Process, ProcessScope},
     reserve,
     run::{RunFile, SharedMemory},
-    storage::{self, retry_on_full_disk},
+    storage::{self, reason_of, retry_on_full_disk},
 };
 
 pub use crate::channel::Channel;
@@ -102,7 +102,7 @@ fn refused(action: &'static str, name: impl Into<String>) -> impl FnOnce(&dyn st
     move |reason| ServiceError::Refused {
         action,
         name,
-        reason: format!("{reason:?}"),
+        reason: reason_of(reason),
     }
 }
 

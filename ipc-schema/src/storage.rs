@@ -110,6 +110,20 @@ pub(crate) fn retry_on_full_disk<T, E: Debug>(
     }
 }
 
+/// iceoryx2's reason for refusing something. It names none where the process, or the machine, can open no further file, so whether one
+/// can is tried.
+pub(crate) fn reason_of(reason: &dyn Debug) -> String {
+    with_cause(format!("{reason:?}"), File::open("/dev/null").err())
+}
+
+fn with_cause(reason: String, unopened: Option<Error>) -> String {
+    let is_of_handles = |error: &Error| matches!(Errno::from_io_error(error), Some(Errno::MFILE | Errno::NFILE));
+    match unopened.filter(is_of_handles) {
+        Some(error) => format!("{reason}: {error}"),
+        None => reason,
+    }
+}
+
 /// Writes a file that has its old content or the new one at any moment, also after a loss of power.
 ///
 /// # Errors
@@ -170,6 +184,18 @@ pub fn exchange(one: &Path, other: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_refusal_names_missing_file_handles_and_nothing_else() {
+        let of = |errno: Errno| with_cause("InternalFailure".into(), Some(errno.into()));
+        assert_eq!(of(Errno::MFILE), "InternalFailure: Too many open files (os error 24)");
+        assert_eq!(
+            of(Errno::NFILE),
+            "InternalFailure: Too many open files in system (os error 23)"
+        );
+        assert_eq!(of(Errno::NOENT), "InternalFailure");
+        assert_eq!(reason_of(&"DoesNotExist"), "\"DoesNotExist\"");
+    }
 
     #[test]
     fn a_file_is_replaced_whole_and_leaves_nothing_beside() {
