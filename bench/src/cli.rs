@@ -65,6 +65,32 @@ impl BenchPart {
     }
 }
 
+/// What drives the trips of `driving`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum BenchDriver {
+    /// Random actions
+    Random,
+    /// The script: pure pursuit
+    Scripted,
+    /// SUMO's own driver
+    Sumo,
+    /// The policy of `--policy`
+    Policy,
+}
+
+impl BenchDriver {
+    /// Value of `CARAWARE_DRIVER`.
+    #[must_use]
+    pub const fn key(self) -> &'static str {
+        match self {
+            Self::Random => "random",
+            Self::Scripted => "scripted",
+            Self::Sumo => "sumo",
+            Self::Policy => "policy",
+        }
+    }
+}
+
 /// Measure a part of caraware on this machine, compared with its peers
 #[derive(Debug, Parser, Clone)]
 #[command(name = "caraware-bench", bin_name = "caraware bench", max_term_width = 110)]
@@ -98,6 +124,9 @@ pub struct BenchArgs {
     /// Trips of each driver in `driving`
     #[arg(long, value_name = "TRIPS", default_value_t = 480, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub trips: u32,
+    /// Drivers of `driving`, separated by commas [default: all; `policy` needs `--policy`]
+    #[arg(long, value_name = "DRIVERS", value_enum, value_delimiter = ',')]
+    pub drivers: Vec<BenchDriver>,
     /// Python that has the peers installed [default: that of `make peers`, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,

@@ -8,15 +8,24 @@ use std::{
     fs,
     path::{Path, PathBuf},
     process::{Command, Stdio},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
+    thread,
 };
 
 use caraware::{failure::Exit, install};
+use clap::ValueEnum as _;
 use serde::Deserialize;
 
 use super::{BenchOptions, BenchReport, ReportTable};
+use crate::cli::BenchDriver;
 
 /// Heroes that begin each episode: trips of an episode.
 const HEROES: u32 = 16;
+/// Most episodes of a run. A longer list goes on with the next seed, so that its runs can be driven side by side.
+const RUN_EPISODES: u32 = 10;
 /// Other vehicles, as shares of the preset's.
 const DENSITIES: [f64; 3] = [0.5, 1.0, 1.5];
 /// Other vehicles of the preset.
@@ -48,14 +57,48 @@ struct TripDriver {
     settings: Vec<String>,
 }
 
+/// A run of the list: the episodes of one seed in one density of traffic.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
+struct TripRun {
+    /// Index of its driver.
+    driver: usize,
+    /// Other vehicles.
+    others: u32,
+    seed: u32,
+    episodes: u32,
+}
+
+/// The runs of `drivers` drivers: `episodes` of each density, in runs of at most [`RUN_EPISODES`].
+fn runs_of(drivers: usize, densities: &[f64], episodes: u32) -> Vec<TripRun> {
+    let mut runs = Vec::new();
+    for driver in 0..drivers {
+        for density in densities {
+            for first in (0..episodes).step_by(RUN_EPISODES as usize) {
+                runs.push(TripRun {
+                    driver,
+                    others: (density * OTHERS).round() as u32,
+                    seed: 1 + first / RUN_EPISODES,
+                    episodes: RUN_EPISODES.min(episodes - first),
+                });
+            }
+        }
+    }
+    runs
+}
+
 #[derive(Debug, Clone, Deserialize)]
 struct Trip {
+    /// The run that it belongs to.
+    #[serde(skip)]
+    run: TripRun,
     episode: u64,
     hero: String,
     length_m: f64,
     end: String,
     time_s: f64,
     way_m: f64,
+    /// Root of the mean square over its ticks, of the speed's second difference.
+    jerk_mps3: f64,
     /// At the end.
     manoeuvre: String,
     /// Stop lines passed, by manoeuvre.
@@ -63,6 +106,13 @@ struct Trip {
     /// Of a trip that ended by a collision.
     #[serde(default)]
     is_at_fault: bool,
+}
+
+impl Trip {
+    /// The same for the same trip of another driver.
+    fn place(&self) -> (u32, u32, u64, &str) {
+        (self.run.others, self.run.seed, self.episode, &self.hero)
+    }
 }
 
 /// A line of a run's `events/collisions.jsonl`, as far as fault depends on it.
@@ -131,14 +181,22 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
              traffic of the preset `driving`, at most {TIME_LIMIT_S} s. Their seeds are used by no training. A trip that does not end \
              in time, or by a contact, beside the road, at a red light or against the traffic, is no arrival. Fault is that of nuPlan: a \
              hero that moves and strikes with its front, or with its side what does not strike with its own front. Intervals are \
-             Wilson's, 95 %. `sumo` is SUMO's own driver in the hero's place, seen by the same checks.",
+             Wilson's, 95 %. `sumo` is SUMO's own driver in the hero's place, seen by the same checks. Time is that of trips on \
+             which both it and the driver arrive, over its time on the same trips. Jerk is the root of the mean square of a trip, \
+             along the vehicle, and the median of trips.",
             episodes * HEROES * densities.len() as u32,
             densities.iter().map(f64::to_string).collect::<Vec<_>>().join(", ")
         ),
     );
     let mut columns = vec!["driver", "trips", "arrived", "95 % interval"];
     columns.extend(&ENDS[1..]);
-    columns.extend(["collisions per 1 000 km", "of these at fault", "m/s on the way"]);
+    columns.extend([
+        "collisions per 1 000 km",
+        "of these at fault",
+        "m/s on the way",
+        "time / SUMO's",
+        "jerk, m/s³",
+    ]);
     let mut all = ReportTable::new("All trips", &columns);
     let mut manoeuvres = ReportTable::new(
         "Collisions by manoeuvre",
@@ -151,18 +209,26 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         ],
     );
     let mut long = ReportTable::new(format!("Trips of {LONG_M} m and more"), &columns);
-    for driver in drivers(options) {
-        let mut driven = Vec::new();
-        for density in densities {
-            driven.extend(drive(&driver, *density, episodes, &caraware, &runs.0)?);
-        }
-        all.push(row(&driver, &driven));
-        for cells in manoeuvre_rows(&driver, &driven) {
+    let drivers = drivers(options)?;
+    let mut driven: Vec<Vec<Trip>> = vec![Vec::new(); drivers.len()];
+    for trip in drive_all(
+        &drivers,
+        &runs_of(drivers.len(), densities, episodes),
+        &caraware,
+        &runs.0,
+    )? {
+        driven[trip.run.driver].push(trip);
+    }
+    let yardstick = drivers.iter().position(|driver| driver.key == "sumo");
+    let yardstick = yardstick.map_or(Vec::new(), |index| driven[index].clone());
+    for (driver, driven) in drivers.iter().zip(&driven) {
+        all.push(row(driver, driven, &yardstick));
+        for cells in manoeuvre_rows(driver, driven) {
             manoeuvres.push(cells);
         }
         let longer: Vec<Trip> = driven.iter().filter(|trip| trip.length_m >= LONG_M).cloned().collect();
-        long.push(row(&driver, &longer));
-        let (share, [low, high]) = arrivals(&driven);
+        long.push(row(driver, &longer, &yardstick));
+        let (share, [low, high]) = arrivals(driven);
         report.figure(format!("{}, arrived", driver.key), share);
         report.figure(format!("{}, arrived, lower end", driver.key), low);
         report.figure(format!("{}, arrived, upper end", driver.key), high);
@@ -171,33 +237,47 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     Ok(report)
 }
 
-fn drivers(options: &BenchOptions) -> Vec<TripDriver> {
-    let map = options.map.iter().flat_map(|map| map_settings(map));
-    let map: Vec<String> = map.collect();
-    let driver = |name, key, settings: &[&str]| TripDriver {
-        name,
-        key,
-        settings: settings
+/// The drivers that are asked for.
+///
+/// # Errors
+/// The policy is asked for, and no file of it is given.
+fn drivers(options: &BenchOptions) -> Result<Vec<TripDriver>, Exit> {
+    let asked = match options.drivers.as_slice() {
+        [] => BenchDriver::value_variants()
             .iter()
-            .map(|&setting| setting.to_owned())
-            .chain(map.clone())
+            .copied()
+            .filter(|driver| *driver != BenchDriver::Policy || options.policy.is_some())
             .collect(),
+        drivers => drivers.to_vec(),
     };
-    let mut drivers = vec![
-        driver("random actions", "random", &[]),
-        driver("script (pure pursuit)", "scripted", &[]),
+    asked.into_iter().map(|driver| trip_driver(driver, options)).collect()
+}
+
+fn trip_driver(driver: BenchDriver, options: &BenchOptions) -> Result<TripDriver, Exit> {
+    let (name, mut settings) = match driver {
+        BenchDriver::Random => ("random actions", Vec::new()),
+        BenchDriver::Scripted => ("script (pure pursuit)", Vec::new()),
         // With the view of the road ahead that mirrors have of SUMO's paths elsewhere.
-        driver(
+        BenchDriver::Sumo => (
             "SUMO's own driver",
-            "sumo",
-            &["task.driver=sumo", "vehicle.preview_s=1.5"],
+            vec!["task.driver=sumo".to_owned(), "vehicle.preview_s=1.5".to_owned()],
         ),
-    ];
-    if let Some(policy) = &options.policy {
-        let place = format!("task.begin_from={}", policy.display());
-        drivers.push(driver("learnt policy", "policy", &[&place]));
-    }
-    drivers
+        BenchDriver::Policy => {
+            let policy = options.policy.as_ref().ok_or_else(|| {
+                Exit::config(
+                    "`--drivers policy` without a policy",
+                    "give --policy a checkpoint, or maps/town/driver.safetensors",
+                )
+            })?;
+            ("learnt policy", vec![format!("task.begin_from={}", policy.display())])
+        }
+    };
+    settings.extend(options.map.iter().flat_map(|map| map_settings(map)));
+    Ok(TripDriver {
+        name,
+        key: driver.key(),
+        settings,
+    })
 }
 
 /// A run's settings for this map. A file's net may have no projection, and where on Earth it is does not matter to a driver.
@@ -209,25 +289,77 @@ fn map_settings(map: &str) -> Vec<String> {
     settings
 }
 
-/// The trips of one driver at one density.
-fn drive(driver: &TripDriver, density: f64, episodes: u32, caraware: &Path, runs: &Path) -> Result<Vec<Trip>, Exit> {
+/// The trips of all runs, in the order of the runs; as many run at once as three quarters of the cores.
+///
+/// # Errors
+/// A run fails. No other is started after it, and those that are driving end first.
+fn drive_all(drivers: &[TripDriver], runs: &[TripRun], caraware: &Path, directory: &Path) -> Result<Vec<Trip>, Exit> {
+    let at_once = (thread::available_parallelism().map_or(1, usize::from) * 3 / 4).clamp(1, runs.len().max(1));
+    let next = AtomicUsize::new(0);
+    let driven = Mutex::new(BTreeMap::new());
+    let failed = Mutex::new(None);
+    let take = |index: usize| {
+        let run = runs.get(index)?;
+        let is_over = failed.lock().unwrap_or_else(PoisonError::into_inner).is_some();
+        (!is_over).then_some(*run)
+    };
+    thread::scope(|scope| {
+        for _ in 0..at_once {
+            scope.spawn(|| {
+                while let Some(run) = take(next.fetch_add(1, Ordering::Relaxed)) {
+                    match drive(&drivers[run.driver], run, caraware, directory) {
+                        Ok(trips) => {
+                            let mut driven = driven.lock().unwrap_or_else(PoisonError::into_inner);
+                            let (name, share) = (drivers[run.driver].name, arrivals(&trips).0);
+                            driven.insert(run, trips);
+                            eprintln!(
+                                "{} of {} runs: {name}, {} others, seed {}: {:.0} % arrived",
+                                driven.len(),
+                                runs.len(),
+                                run.others,
+                                run.seed,
+                                100.0 * share
+                            );
+                        }
+                        Err(error) => {
+                            let mut failed = failed.lock().unwrap_or_else(PoisonError::into_inner);
+                            failed.get_or_insert(error);
+                        }
+                    }
+                }
+            });
+        }
+    });
+    match failed.into_inner().unwrap_or_else(PoisonError::into_inner) {
+        Some(error) => Err(error),
+        None => Ok(driven
+            .into_inner()
+            .unwrap_or_else(PoisonError::into_inner)
+            .into_values()
+            .flatten()
+            .collect()),
+    }
+}
+
+/// The trips of one run.
+fn drive(driver: &TripDriver, part: TripRun, caraware: &Path, runs: &Path) -> Result<Vec<Trip>, Exit> {
+    let name = format!("{}-{}-{}", driver.key, part.others, part.seed);
     let mut settings = vec![
         "trainer.module=caraware.driving.trips".to_owned(),
+        format!("run.seed={}", part.seed),
         format!("traffic.heroes={HEROES}"),
-        format!("traffic.others={}", (density * OTHERS).round()),
+        format!("traffic.others={}", part.others),
         format!("task.time_limit_s={TIME_LIMIT_S}"),
         "episode.ticks=1".into(),
         "episode.training_episodes=1".into(),
         // Every hero of the list departs within seconds.
         format!("episode.evaluation_ticks={}", (TIME_LIMIT_S + 10) * 10),
-        format!("episode.final_evaluations={episodes}"),
+        format!("episode.final_evaluations={}", part.episodes),
         "fanout.enabled=false".into(),
     ];
     settings.extend(driver.settings.iter().cloned());
     let mut command = Command::new(caraware);
-    command
-        .args(["train", "driving", "--name", "trips", "--runs"])
-        .arg(runs);
+    command.args(["train", "driving", "--name", &name, "--runs"]).arg(runs);
     settings.iter().for_each(|setting| {
         command.args(["--set", setting]);
     });
@@ -242,12 +374,13 @@ fn drive(driver: &TripDriver, density: f64, episodes: u32, caraware: &Path, runs
             String::from_utf8_lossy(&output.stderr).into_owned(),
         ));
     }
-    let run = runs.join("trips");
+    let run = runs.join(name);
     let path = run.join("report.json");
     let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
     let unreadable = |error: serde_json::Error| Exit::run(format!("{}: {error}", path.display()), "");
     let result: serde_json::Value = serde_json::from_str(&text).map_err(unreadable)?;
     let mut trips: Vec<Trip> = serde_json::from_value(result["trainer"]["trips"].clone()).map_err(unreadable)?;
+    trips.iter_mut().for_each(|trip| trip.run = part);
     find_faults(&mut trips, &run.join("events/collisions.jsonl"))?;
     fs::remove_dir_all(&run).map_err(|error| Exit::io("remove", &run, &error))?;
     Ok(trips)
@@ -268,7 +401,8 @@ fn find_faults(trips: &mut [Trip], lines: &Path) -> Result<(), Exit> {
     Ok(())
 }
 
-fn row(driver: &TripDriver, trips: &[Trip]) -> Vec<String> {
+/// `yardstick`: the trips of SUMO's driver.
+fn row(driver: &TripDriver, trips: &[Trip], yardstick: &[Trip]) -> Vec<String> {
     let mut ends: BTreeMap<&str, usize> = BTreeMap::new();
     for trip in trips {
         *ends.entry(trip.end.as_str()).or_default() += 1;
@@ -288,7 +422,33 @@ fn row(driver: &TripDriver, trips: &[Trip]) -> Vec<String> {
     let faults = trips.iter().filter(|trip| trip.is_at_fault).count();
     cells.extend([count("collision"), faults].map(|count| format!("{:.0}", count as f64 / (way_m / 1e6).max(1e-9))));
     cells.push(format!("{:.1}", way_m / f64::max(time_s, 1e-9)));
+    cells.push(time_ratio(trips, yardstick).map_or("–".into(), |ratio| format!("{ratio:.2}")));
+    let mut jerks: Vec<f64> = trips.iter().map(|trip| trip.jerk_mps3).collect();
+    jerks.sort_by(f64::total_cmp);
+    cells.push(
+        jerks
+            .get(jerks.len() / 2)
+            .map_or("–".into(), |jerk| format!("{jerk:.1}")),
+    );
     cells
+}
+
+/// Time of the trips on which both drivers arrive, over that of the yardstick; `None` without such trips.
+fn time_ratio(trips: &[Trip], yardstick: &[Trip]) -> Option<f64> {
+    let has_arrived = |trip: &&Trip| trip.end == ENDS[0];
+    let of_yardstick: BTreeMap<_, f64> = yardstick
+        .iter()
+        .filter(has_arrived)
+        .map(|trip| (trip.place(), trip.time_s))
+        .collect();
+    let both = trips
+        .iter()
+        .filter(has_arrived)
+        .filter_map(|trip| Some((trip.time_s, of_yardstick.get(&trip.place())?)));
+    let (time_s, yardstick_s) = both.fold((0.0, 0.0), |(time_s, yardstick_s), (own_s, other_s)| {
+        (time_s + own_s, yardstick_s + other_s)
+    });
+    (yardstick_s > 0.0).then(|| time_s / yardstick_s)
 }
 
 /// One row for each manoeuvre that was driven, and for the ways between them.
@@ -366,6 +526,8 @@ mod tests {
 
     fn trip(end: &str, is_at_fault: bool) -> Trip {
         Trip {
+            run: TripRun::default(),
+            jerk_mps3: 1.25,
             episode: 0,
             hero: "hero.0".into(),
             length_m: 600.0,
@@ -395,15 +557,55 @@ mod tests {
             trip("blocked", false),
             trip("time limit", false),
         ];
-        let cells = row(&driver(), &trips);
+        let cells = row(&driver(), &trips, &[]);
         assert_eq!(cells[1..3], ["5", "20.0 %"]);
         assert_eq!(cells[4..11], ["2", "0", "0", "0", "1", "1", "0"]);
         // Two collisions in 2.5 km, one of them at fault, 2.5 km in 250 s.
-        assert_eq!(cells[11..], ["800", "400", "10.0"]);
+        assert_eq!(cells[11..], ["800", "400", "10.0", "–", "1.2"]);
         assert_eq!(
             manoeuvre_rows(&driver(), &trips),
             [["d", "left turn, yielding", "10", "2", "1"]]
         );
+    }
+
+    #[test]
+    fn time_is_compared_on_the_trips_on_which_both_arrive() {
+        let of = |seed: u32, hero: &str, end: &str, time_s: f64| Trip {
+            run: TripRun {
+                seed,
+                ..TripRun::default()
+            },
+            hero: hero.into(),
+            time_s,
+            ..trip(end, false)
+        };
+        let yardstick = [
+            of(1, "hero.0", "arrival", 40.0),
+            of(1, "hero.1", "collision", 5.0),
+            of(2, "hero.0", "arrival", 60.0),
+        ];
+        let trips = [
+            of(2, "hero.0", "arrival", 90.0),
+            of(1, "hero.0", "arrival", 50.0),
+            of(1, "hero.1", "arrival", 70.0),
+            of(3, "hero.0", "arrival", 80.0),
+        ];
+        assert_eq!(time_ratio(&trips, &yardstick), Some(1.4));
+        assert_eq!(time_ratio(&trips[2..], &yardstick), None);
+    }
+
+    #[test]
+    fn a_list_begins_with_the_shorter_one_and_goes_on_with_other_seeds() {
+        let short = runs_of(2, &DENSITIES, 10);
+        assert_eq!(short.len(), 6);
+        assert!(short.iter().all(|run| (run.seed, run.episodes) == (1, 10)));
+        let long = runs_of(2, &DENSITIES, 63);
+        assert_eq!(long.len(), 42);
+        assert!(short.iter().all(|run| long.contains(run)));
+        let episodes: u32 = long.iter().filter(|run| run.driver == 1).map(|run| run.episodes).sum();
+        assert_eq!(episodes, 3 * 63);
+        let others: Vec<u32> = long[..21].iter().map(|run| run.others).collect();
+        assert_eq!([others[0], others[7], others[20]], [10, 20, 30]);
     }
 
     #[test]

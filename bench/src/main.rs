@@ -35,7 +35,7 @@ use std::{io::Write as _, path::PathBuf, process::ExitCode};
 use caraware::{failure::Exit, install};
 use clap::Parser as _;
 
-use crate::cli::{BenchArgs, BenchPart};
+use crate::cli::{BenchArgs, BenchDriver, BenchPart};
 use report::{BenchReport, CurveLine, MedianSpread, ReportCurve, ReportTable};
 
 /// Options of a measurement.
@@ -57,6 +57,8 @@ pub struct BenchOptions {
     pub policy: Option<PathBuf>,
     /// Trips of each driver.
     pub trips: u32,
+    /// The drivers; empty: all.
+    pub drivers: Vec<BenchDriver>,
 }
 
 fn main() -> ExitCode {
@@ -94,6 +96,7 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
             .as_ref()
             .map(|path| std::path::absolute(path).unwrap_or_else(|_| path.clone())),
         trips: args.trips,
+        drivers: args.drivers.clone(),
         map: args.map.clone(),
     };
     let parts = match args.part {

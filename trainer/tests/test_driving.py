@@ -11,7 +11,7 @@ from caraware import _native
 from caraware.driving.imitate import Teacher, clone
 from caraware.driving.lessons import Lessons, Limits
 from caraware.driving.manoeuvres import BETWEEN, NEEDED, Manoeuvres
-from caraware.driving.trips import TripLog
+from caraware.driving.trips import Motion, TripLog
 from caraware.ipc.channel import ENDED_BY
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.config import TrainerConfig
@@ -256,6 +256,18 @@ def test_a_trip_is_that_of_a_hero_of_the_list_and_counts_once() -> None:
         (0, "hero.1", "arrival", 400, 2.0),
         (1, "hero.0", "end of the run's episode", 700, 0.0),
     ]
+
+
+def test_jerk_is_of_the_second_difference_of_the_speed_alone() -> None:
+    steady = Motion(3.0)
+    assert [steady.advance(3.0 + 0.2 * tick, 0.1) for tick in range(1, 4)] == pytest.approx([2.0] * 3)
+    assert steady.jerk_mps3() == pytest.approx(0.0, abs=1e-9)
+    jerky = Motion(3.0)
+    assert jerky.jerk_mps3() == 0.0
+    # 2, 0 and −1 m/s²: 20 and 10 m/s³.
+    for speed in (3.2, 3.2, 3.1):
+        jerky.advance(speed, 0.1)
+    assert jerky.jerk_mps3() == pytest.approx(math.sqrt((20.0**2 + 10.0**2) / 2))
 
 
 def test_a_manoeuvre_is_how_the_hero_turns_and_who_has_the_right_of_way_until_the_junction_is_behind() -> None:

@@ -9,6 +9,7 @@ It may take a live run over from a learner, and leaves it to another at any tick
 is committed when it leaves, because no learner can learn from actions that it did not draw.
 """
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -52,10 +53,33 @@ class Trip:
     """Driven."""
     harshest_mps2: float
     """Largest change of speed in a tick."""
+    jerk_mps3: float
+    """Along the hero: root of the mean square, over its ticks, of the speed's second difference."""
     manoeuvre: str
     """At the end: see `caraware.driving.manoeuvres`."""
     passed: dict[str, int]
     """Stop lines passed, by manoeuvre."""
+
+
+class Motion:
+    """The speed of a hero from tick to tick."""
+
+    def __init__(self, speed_mps: float) -> None:
+        self._speed_mps, self._accel_mps2 = speed_mps, math.nan
+        self._sum, self._ticks = 0.0, 0
+
+    def advance(self, speed_mps: float, tick_s: float) -> float:
+        """Take the next tick's speed; its acceleration, m/s²."""
+        accel_mps2 = (speed_mps - self._speed_mps) / tick_s
+        if not math.isnan(self._accel_mps2):
+            self._sum += ((accel_mps2 - self._accel_mps2) / tick_s) ** 2
+            self._ticks += 1
+        self._speed_mps, self._accel_mps2 = speed_mps, accel_mps2
+        return accel_mps2
+
+    def jerk_mps3(self) -> float:
+        """Root of the mean square so far; 0 before the third tick."""
+        return math.sqrt(self._sum / self._ticks) if self._ticks else 0.0
 
 
 class TripLog:
@@ -65,7 +89,7 @@ class TripLog:
         self._names, self._task = Names(run), task
         self._heroes = {f"hero.{number}" for number in range(setting(run, "traffic.heroes", int))}
         self._open: dict[int, Trip] = {}
-        self._speed: dict[int, float] = {}
+        self._motion: dict[int, Motion] = {}
         self._manoeuvres: dict[int, Manoeuvres] = {}
         self._episode = -1
         self.trips: list[Trip] = []
@@ -84,20 +108,20 @@ class TripLog:
             speed = float(obs.truth[slot, 3])
             if slot in self._open:
                 trip = self._open[slot]
-                trip.harshest_mps2 = max(trip.harshest_mps2, abs(speed - self._speed[slot]) / tick_s)
+                trip.harshest_mps2 = max(trip.harshest_mps2, abs(self._motion[slot].advance(speed, tick_s)))
                 trip.time_s += tick_s
                 trip.way_m += speed * tick_s
             elif (hero := self._names.of(obs.id_hash[slot])) in self._heroes and not self._has_driven(hero):
                 left_m = float(self._task.fields.si_tensor(obs.observation[slot : slot + 1], "route_left")[0])
-                self._open[slot] = Trip(obs.episode, hero, left_m, "", 0.0, 0.0, 0.0, BETWEEN, {})
-                self._manoeuvres[slot] = Manoeuvres()
+                self._open[slot] = Trip(obs.episode, hero, left_m, "", 0.0, 0.0, 0.0, 0.0, BETWEEN, {})
+                self._manoeuvres[slot], self._motion[slot] = Manoeuvres(), Motion(speed)
             if slot in self._open:
                 self._manoeuvres[slot].add(self._task.fields, obs.observation[slot], speed * tick_s)
-            self._speed[slot] = speed
 
     def _close(self, slot: int, trip: Trip) -> None:
         manoeuvres = self._manoeuvres.pop(slot)
         trip.manoeuvre, trip.passed = manoeuvres.now, manoeuvres.passed
+        trip.jerk_mps3 = self._motion.pop(slot).jerk_mps3()
         self.trips.append(trip)
 
     def _has_driven(self, hero: str) -> bool:
@@ -145,6 +169,8 @@ def policy(run: RunFile) -> Driver:
     assert isinstance(task, Driving)
     ppo = build_ppo(config, task.fields.width, task)
     begin_from(ppo.updater.parameters(), Path(place))
+    # The same trips end alike on every machine: "auto" rounds to bfloat16 where a processor has units for it.
+    torch.set_float32_matmul_precision("highest")
     return lambda obs: ppo.updater.mean(torch.nan_to_num(obs.observation))
 
 
