@@ -17,7 +17,7 @@ use ipc_schema::{
 
 use super::{Bridge, EpisodeCounts, commands::CommandContext};
 use crate::{
-    heroes,
+    heroes::{self, passing::HeroPassing},
     population::{HeroRoutes, Population, PopulationSize, trips::TripSelection},
     sumo::{
         Sumo,
@@ -37,6 +37,7 @@ pub(super) struct RunningEpisode {
     pub(super) frame: TrafficFrame,
     /// Where SUMO steps more slowly than the mirror needs.
     interpolation: Option<StepInterpolation>,
+    passing: HeroPassing,
     episode: Episode,
 }
 
@@ -230,6 +231,7 @@ impl Bridge {
             population,
             frame: TrafficFrame::default(),
             interpolation,
+            passing: HeroPassing::default(),
             episode: *episode,
         })
     }
@@ -245,6 +247,7 @@ impl Bridge {
             population,
             frame,
             interpolation,
+            passing,
             episode,
         } = running;
         loop {
@@ -287,7 +290,11 @@ impl Bridge {
             if self.poses.is_some() {
                 let config = &self.membership.run.config;
                 let points = heroes::take_over(sumo, frame, config.task.driver, config.advises_heroes())?;
+                let driver = config.task.driver;
                 self.outbox.publish_routes(&points, header)?;
+                if driver == HeroDriver::Actions {
+                    passing.update(sumo, frame)?;
+                }
             }
             let header = match interpolation {
                 Some(interpolation) => self.publish_between(interpolation, frame, header)?,

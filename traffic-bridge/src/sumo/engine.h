@@ -77,6 +77,8 @@ public:
     void take_over(std::uint32_t index, bool keeps_limits) override;
     void move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) override;
     double own_speed(std::uint32_t index) const override;
+    rust::Vec<double> way_past(std::uint32_t index, std::uint32_t hero) const override;
+    void ignore_in_junctions(std::uint32_t index, rust::Slice<const std::uint32_t> heroes) override;
     void remove_by_index(std::uint32_t index) override;
     std::int32_t lane_index(std::uint32_t index) const override;
     rust::Vec<RawLane> route_lanes(std::uint32_t index) const override;

@@ -24,7 +24,12 @@ constexpr double UNLIMITED = 100.0;
 // A link through a junction has at most two internal lanes in sequence; more would be a loop.
 constexpr int MAX_INTERNAL_LANES = 8;
 
+// How far a vehicle looks for what it waits for, metres.
+constexpr double LOOKS_AHEAD_M = 30.0;
+
 using LaneShape = rust::Vec<double>;
+
+bool is_in_junction(const std::string& lane) { return !lane.empty() && lane.front() == ':'; }
 
 void append(LaneShape& shape, const std::string& lane) {
     for (const libsumo::TraCIPosition& point : engine::Lane::getShape(lane).value) {
@@ -113,6 +118,45 @@ void EngineSimulation::move_vehicle(std::uint32_t index, double x, double y, dou
 }
 
 double EngineSimulation::own_speed(std::uint32_t index) const { return engine::Vehicle::getSpeedWithoutTraCI(known_id(index)); }
+
+rust::Vec<double> EngineSimulation::way_past(std::uint32_t index, std::uint32_t hero) const {
+    LaneShape result;
+    const std::string& id = known_id(index);
+    const std::string& hero_id = known_id(hero);
+    const std::string hero_lane = engine::Vehicle::getLaneID(hero_id);
+    const std::string lane = engine::Vehicle::getLaneID(id);
+    if (lane.empty() || lane == hero_lane || !is_in_junction(hero_lane)) {
+        return result;
+    }
+    const auto foes = engine::Vehicle::getJunctionFoes(id, LOOKS_AHEAD_M);
+    const bool gives_way = std::any_of(foes.begin(), foes.end(), [&](const libsumo::TraCIJunctionFoe& foe) {
+        return foe.foeId == hero_id && foe.egoResponse;
+    });
+    if (!gives_way && engine::Vehicle::getLeader(id, LOOKS_AHEAD_M).first != hero_id) {
+        return result;
+    }
+    append(result, lane);
+    const std::vector<libsumo::TraCIConnection> onward = engine::Vehicle::getNextLinks(id);
+    if (onward.empty()) {
+        return result;
+    }
+    std::string internal = onward.front().approachedInternal;
+    for (int count = 0; !internal.empty() && count < MAX_INTERNAL_LANES; ++count) {
+        append(result, internal);
+        const std::vector<libsumo::TraCIConnection> after = engine::Lane::getLinks(internal);
+        internal = after.empty() ? std::string() : after.front().approachedInternal;
+    }
+    append(result, onward.front().approachedLane);
+    return result;
+}
+
+void EngineSimulation::ignore_in_junctions(std::uint32_t index, rust::Slice<const std::uint32_t> heroes) {
+    std::string ids;
+    for (const std::uint32_t hero : heroes) {
+        ids += (ids.empty() ? "" : " ") + known_id(hero);
+    }
+    engine::Vehicle::setParameter(known_id(index), "junctionModel.ignoreIDs", ids);
+}
 
 void EngineSimulation::remove_by_index(std::uint32_t index) {
     if (const std::string* id = id_of(index); id != nullptr) {

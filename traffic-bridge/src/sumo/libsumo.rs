@@ -233,6 +233,11 @@ pub mod ffi {
         ) -> Result<()>;
         /// Speed that SUMO's own driver would have brought the vehicle to in the last step, m/s.
         fn own_speed(self: &Simulation, index: u32) -> Result<f64>;
+        /// The way of a vehicle through the junction ahead or around it (x, y, x, y, …; net, metres), if it waits for a hero that is in a
+        /// junction and not before it on its own lane; empty if it does not.
+        fn way_past(self: &Simulation, index: u32, hero: u32) -> Result<Vec<f64>>;
+        /// From now on the vehicle does not wait in junctions for these, and for no others than these.
+        fn ignore_in_junctions(self: Pin<&mut Simulation>, index: u32, heroes: &[u32]) -> Result<()>;
         /// Removes the vehicle with this dense index; does nothing if there is no such vehicle.
         fn remove_by_index(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
         /// Number of the lane on which the vehicle is, from the right.

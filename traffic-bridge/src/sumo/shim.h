@@ -64,6 +64,8 @@ public:
     virtual void take_over(std::uint32_t index, bool keeps_limits) = 0;
     virtual void move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) = 0;
     virtual double own_speed(std::uint32_t index) const = 0;
+    virtual rust::Vec<double> way_past(std::uint32_t index, std::uint32_t hero) const = 0;
+    virtual void ignore_in_junctions(std::uint32_t index, rust::Slice<const std::uint32_t> heroes) = 0;
     virtual void remove_by_index(std::uint32_t index) = 0;
     virtual std::int32_t lane_index(std::uint32_t index) const = 0;
     virtual rust::Vec<RawLane> route_lanes(std::uint32_t index) const = 0;

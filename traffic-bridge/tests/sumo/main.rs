@@ -5,6 +5,7 @@ mod advice;
 mod interpolation;
 mod lifecycle;
 mod objects;
+mod passing;
 mod population;
 mod process;
 mod right_of_way;

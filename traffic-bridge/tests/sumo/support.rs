@@ -69,11 +69,16 @@ impl Bench {
 
     /// SUMO with the town and these vehicles, all of them heroes: id, where it departs (metres), and the edges of its route.
     pub fn town_of_heroes(&self, heroes: &[(&str, f64, &str)]) -> Sumo {
+        self.town_with(heroes, heroes.iter().map(|(id, ..)| *id))
+    }
+
+    /// SUMO with the town and these vehicles, some of them heroes.
+    pub fn town_with<'a>(&self, vehicles: &[(&str, f64, &str)], heroes: impl Iterator<Item = &'a str>) -> Sumo {
         let (net, _) = self.town();
         let vehicle = |(id, at_m, edges): &(&str, f64, &str)| {
             format!("<vehicle id=\"{id}\" depart=\"0\" departPos=\"{at_m}\"><route edges=\"{edges}\"/></vehicle>")
         };
-        let vehicles: String = heroes.iter().map(vehicle).collect();
+        let vehicles: String = vehicles.iter().map(vehicle).collect();
         self.file("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
         let scenario = self.file(
             "a.sumocfg",
@@ -87,7 +92,7 @@ impl Bench {
             0.1,
             23423,
             ConnectedRule::Scenario {
-                heroes: heroes.iter().map(|(id, ..)| (*id).to_owned()).collect(),
+                heroes: heroes.map(str::to_owned).collect(),
                 cav_share: 0.0,
                 max_cavs: 0,
             },
