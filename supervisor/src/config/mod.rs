@@ -123,7 +123,8 @@ impl LayeredSettings {
             let text = format!("{path} = {value}");
             let span = text.len() - value.to_string().len()..text.len();
             let place = span::SourceSpan {
-                source: std::sync::Arc::new(miette::NamedSource::new(source, text)),
+                // An error shows this line, which no file has.
+                source: std::sync::Arc::new(miette::NamedSource::new(format!("suggested by {source}"), text)),
                 span,
             };
             *setting = LocatedValue {
