@@ -32,7 +32,8 @@ ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
 PICTURE_MODE = os.environ.get("CARAWARE_SCREENSHOT_MODE", "train")
-SIZE = (1000, 640)
+SIZE = (1500, 900) if PICTURE else (1000, 640)
+"""Of the window: a picture for the documentation is as large as users' windows, a small one is drawn sooner."""
 # Paced, so that the browser's software renderer keeps up and the filter runs. Small batches make the learner update
 # after seconds.
 SETTINGS = (

@@ -1,4 +1,4 @@
-"""Surfaces of the 3-D view: walls and roofs of buildings, roads, walks, and the ground, as triangles."""
+"""Surfaces of the 3-D view: walls and roofs of buildings, roads and walks, as triangles."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def strips(lanes: Iterable[Lane], color: Sequence[int], raised_m: float) -> Surf
         left, right = np.hstack([line[:, :2] + aside, height]), np.hstack([line[:, :2] - aside, height])
         found.append(np.stack([right[:-1], right[1:], left[1:]], axis=1))
         found.append(np.stack([right[:-1], left[1:], left[:-1]], axis=1))
-    return _plain(np.concatenate(found), color)
+    return plain(np.concatenate(found), color)
 
 
 def areas(polygons: Iterable[Area], color: Sequence[int], raised_m: float) -> Surface:
@@ -110,27 +110,13 @@ def areas(polygons: Iterable[Area], color: Sequence[int], raised_m: float) -> Su
         if len(outline) > 2:
             height_m = outline[:, 2].mean() if outline.shape[1] > 2 else 0.0
             found.append(_at_height(triangles_m(outline[:, :2]), height_m + raised_m))
-    return _plain(np.concatenate(found), color)
-
-
-def ground(bounds_m: Sequence[float], height_m: float, color: Sequence[int]) -> Surface:
-    """A plane under the whole map, and as far around it again."""
-    x_min, y_min, x_max, y_max = bounds_m
-    wide, high = x_max - x_min, y_max - y_min
-    corners = np.array(
-        [
-            [x_min - wide, y_min - high],
-            [x_max + wide, y_min - high],
-            [x_max + wide, y_max + high],
-            [x_min - wide, y_max + high],
-        ]
-    )
-    return _plain(_at_height(corners[[[0, 1, 2], [0, 2, 3]]], height_m), color)
+    return plain(np.concatenate(found), color)
 
 
 def _at_height(flat_m: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
     return np.concatenate([flat_m, np.full((*flat_m.shape[:-1], 1), height_m)], axis=-1)
 
 
-def _plain(corners_m: NDArray[np.float64], color: Sequence[int]) -> Surface:
+def plain(corners_m: NDArray[np.float64], color: Sequence[int]) -> Surface:
+    """Triangles `[t, 3, 3]` of one colour."""
     return Surface(corners_m.astype(np.float32), np.tile(np.array(color, np.uint8), (len(corners_m), 1)))

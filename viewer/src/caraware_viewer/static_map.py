@@ -12,6 +12,7 @@ from caraware_viewer import paint, solid
 from caraware_viewer.canvas import Canvas, on_screen
 from caraware_viewer.documents import Area, Building, Lane, Obstacle, RunMap, SceneDocument
 from caraware_viewer.geometry import hatching_m, quaternions
+from caraware_viewer.ground import ground
 from caraware_viewer.paint import CROSSING_COLOR, MARKING_COLOR, MARKING_M, ROAD_KINDS, STRIPE_M, RoadPaint
 from caraware_viewer.wire import FrameError
 
@@ -117,9 +118,8 @@ def _draw_surfaces(canvas: Canvas, bounds_m: list[float], lanes: list[Lane], sce
     """Draws the surfaces of the 3-D view, each a little above the one below, so that the nearer one is seen."""
     polygons, buildings = scene.get("areas", []), scene.get("buildings", [])
     roads = [lane for lane in lanes if lane["kind"] in ROAD_KINDS]
-    heights_m = [point[2] for lane in lanes for point in lane["points_m"]]
     surfaces = {
-        SPACE_GROUND: solid.ground(bounds_m, min(heights_m, default=0.0) - 0.1, GROUND_COLOR),
+        SPACE_GROUND: ground(bounds_m, lanes, GROUND_COLOR),
         SPACE_ROADS: solid.strips(roads, ROAD_COLOR, 0.0),
         SPACE_JUNCTIONS: solid.areas([a for a in polygons if a["kind"] == "junction"], ROAD_COLOR, 0.01),
         SPACE_WALKS: solid.strips([lane for lane in lanes if lane["kind"] == "sidewalk"], WALK_COLOR, 0.02),
