@@ -242,15 +242,29 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
 /// # Errors
 /// The policy is asked for, and no file of it is given.
 fn drivers(options: &BenchOptions) -> Result<Vec<TripDriver>, Exit> {
-    let asked = match options.drivers.as_slice() {
-        [] => BenchDriver::value_variants()
-            .iter()
-            .copied()
-            .filter(|driver| *driver != BenchDriver::Policy || options.policy.is_some())
-            .collect(),
-        drivers => drivers.to_vec(),
+    asked(&options.drivers, options.policy.is_some())
+        .into_iter()
+        .map(|driver| trip_driver(driver, options))
+        .collect()
+}
+
+/// Each of `drivers` once, in their order; without any, all that there are.
+fn asked(drivers: &[BenchDriver], has_policy: bool) -> Vec<BenchDriver> {
+    let all = BenchDriver::value_variants().iter().copied();
+    let all = all.filter(|driver| has_policy || *driver != BenchDriver::Policy);
+    let named = drivers.iter().copied();
+    let drivers: Vec<BenchDriver> = if drivers.is_empty() {
+        all.collect()
+    } else {
+        named.collect()
     };
-    asked.into_iter().map(|driver| trip_driver(driver, options)).collect()
+    let mut asked = Vec::new();
+    for driver in drivers {
+        if !asked.contains(&driver) {
+            asked.push(driver);
+        }
+    }
+    asked
 }
 
 fn trip_driver(driver: BenchDriver, options: &BenchOptions) -> Result<TripDriver, Exit> {
@@ -566,6 +580,14 @@ mod tests {
             manoeuvre_rows(&driver(), &trips),
             [["d", "left turn, yielding", "10", "2", "1"]]
         );
+    }
+
+    #[test]
+    fn a_driver_that_is_named_twice_drives_once() {
+        use BenchDriver::{Policy, Random, Scripted, Sumo};
+        assert_eq!(asked(&[Sumo, Policy, Sumo], true), [Sumo, Policy]);
+        assert_eq!(asked(&[], true), [Random, Scripted, Sumo, Policy]);
+        assert_eq!(asked(&[], false), [Random, Scripted, Sumo]);
     }
 
     #[test]
