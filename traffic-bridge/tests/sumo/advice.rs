@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::support::Bench;
+use crate::support::{Bench, straight_on};
 use ipc_schema::{
     config::HeroDriver,
     ego::EgoPose,
@@ -28,7 +28,11 @@ fn advised(speed_mps: f64, is_alone: bool) -> Vec<(f64, f64)> {
             Some("behind") => speed_mps,
             _ => 0.0,
         };
-        let poses: Vec<EgoPose> = frame.states.iter().map(|state| pose(state, speed_of(state))).collect();
+        let poses: Vec<EgoPose> = frame
+            .states
+            .iter()
+            .map(|state| straight_on(state, speed_of(state)))
+            .collect();
         apply(&mut sumo, &frame, &poses, HeroDriver::Actions).unwrap();
         sumo.step(&mut frame).unwrap();
         let advice = advice(&sumo, &frame, &poses).unwrap();
@@ -52,18 +56,6 @@ fn advised(speed_mps: f64, is_alone: bool) -> Vec<(f64, f64)> {
     }
     sumo.close().unwrap();
     seen
-}
-
-fn pose(state: &TrafficState, speed_mps: f64) -> EgoPose {
-    EgoPose {
-        front_x_m: state.front_x_m,
-        front_y_m: state.front_y_m,
-        yaw_rad: f64::from(state.yaw_rad),
-        speed_mps,
-        accel_mps2: 0.0,
-        vehicle: state.vehicle,
-        flags: 0,
-    }
 }
 
 #[test]

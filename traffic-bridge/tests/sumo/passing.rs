@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::support::Bench;
-use ipc_schema::{config::HeroDriver, ego::EgoPose, traffic::TrafficState};
+use crate::support::{Bench, straight_on};
+use ipc_schema::{config::HeroDriver, traffic::TrafficState};
 use traffic_bridge::{
     heroes::{apply, passing::HeroPassing, take_over},
     sumo::frame::TrafficFrame,
@@ -25,14 +25,9 @@ fn leaves_at_s(stands_y_m: f64, is_passed: bool) -> Option<f64> {
     let mut passing = HeroPassing::default();
     let mut left_s = None;
     while left_s.is_none() && frame.time_s < 180.0 {
-        let of = |frame: &TrafficFrame, ids: &BTreeMap<u32, String>, id: &str| {
-            let mut states = frame.states.iter();
-            states.find(|state| ids[&state.vehicle] == id).copied()
-        };
-        let hero = of(&frame, &ids, "hero");
-        let pose = hero.map(|state| {
-            let speed_mps = if state.front_y_m < stands_y_m { HERO_MPS } else { 0.0 };
-            pose(&state, speed_mps)
+        let pose = state_of(&frame, &ids, "hero").map(|hero| {
+            let speed_mps = if hero.front_y_m < stands_y_m { HERO_MPS } else { 0.0 };
+            straight_on(hero, speed_mps)
         });
         apply(&mut sumo, &frame, pose.as_slice(), HeroDriver::Actions).unwrap();
         sumo.step(&mut frame).unwrap();
@@ -41,23 +36,15 @@ fn leaves_at_s(stands_y_m: f64, is_passed: bool) -> Option<f64> {
         if is_passed {
             passing.update(&mut sumo, &frame).unwrap();
         }
-        let other = of(&frame, &ids, "other").unwrap();
+        let other = state_of(&frame, &ids, "other").unwrap();
         left_s = (other.front_y_m > BEHIND_Y_M).then_some(frame.time_s);
     }
     sumo.close().unwrap();
     left_s
 }
 
-fn pose(state: &TrafficState, speed_mps: f64) -> EgoPose {
-    EgoPose {
-        front_x_m: state.front_x_m,
-        front_y_m: state.front_y_m,
-        yaw_rad: f64::from(state.yaw_rad),
-        speed_mps,
-        accel_mps2: 0.0,
-        vehicle: state.vehicle,
-        flags: 0,
-    }
+fn state_of<'a>(frame: &'a TrafficFrame, ids: &BTreeMap<u32, String>, id: &str) -> Option<&'a TrafficState> {
+    frame.states.iter().find(|state| ids[&state.vehicle] == id)
 }
 
 #[test]

@@ -6,7 +6,11 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-use ipc_schema::run::{ScenarioOptions, Source};
+use ipc_schema::{
+    ego::EgoPose,
+    run::{ScenarioOptions, Source},
+    traffic::TrafficState,
+};
 use tempfile::TempDir;
 use traffic_bridge::sumo::{
     Sumo,
@@ -28,6 +32,19 @@ pub struct Bench {
 /// The directory of the wheel.
 pub fn sumo_home() -> PathBuf {
     PathBuf::from(env!("CARAWARE_BUILD_SUMO_HOME"))
+}
+
+/// The pose of a hero where SUMO has it, which drives straight on.
+pub fn straight_on(state: &TrafficState, speed_mps: f64) -> EgoPose {
+    EgoPose {
+        front_x_m: state.front_x_m,
+        front_y_m: state.front_y_m,
+        yaw_rad: f64::from(state.yaw_rad),
+        speed_mps,
+        accel_mps2: 0.0,
+        vehicle: state.vehicle,
+        flags: 0,
+    }
 }
 
 impl Bench {
