@@ -288,13 +288,7 @@ impl Bridge {
                 return Ok(EpisodeEnd::Stopped);
             }
             if self.poses.is_some() {
-                let config = &self.membership.run.config;
-                let points = heroes::take_over(sumo, frame, config.task.driver, config.advises_heroes())?;
-                let driver = config.task.driver;
-                self.outbox.publish_routes(&points, header)?;
-                if driver == HeroDriver::Actions {
-                    passing.update(sumo, frame)?;
-                }
+                self.follow_heroes(sumo, frame, passing, header)?;
             }
             let header = match interpolation {
                 Some(interpolation) => self.publish_between(interpolation, frame, header)?,
@@ -447,6 +441,24 @@ impl Bridge {
             }
         }
         Ok(Some(Vec::new()))
+    }
+
+    /// Takes control of the heroes that departed in the step, sends their routes, and lets others pass those that stand.
+    fn follow_heroes(
+        &mut self,
+        sumo: &mut Sumo,
+        frame: &TrafficFrame,
+        passing: &mut HeroPassing,
+        header: MessageHeader,
+    ) -> Result<(), Failure> {
+        let config = &self.membership.run.config;
+        let driver = config.task.driver;
+        let points = heroes::take_over(sumo, frame, driver, config.advises_heroes())?;
+        self.outbox.publish_routes(&points, header)?;
+        if driver == HeroDriver::Actions {
+            passing.update(sumo, frame)?;
+        }
+        Ok(())
     }
 
     fn episode_ends(&self, sumo: &Sumo, episode: &Episode, frame: &TrafficFrame) -> Result<bool, SumoError> {
