@@ -517,3 +517,32 @@ fn heroes_that_sumo_drives_arrive_with_a_view_of_the_road_ahead() {
     );
     workplace.assert_nothing_left();
 }
+
+/// The pupil's rows come from both worlds: one alone would not be enough for a first lesson.
+#[test]
+fn a_policy_is_taught_where_it_drives_in_two_worlds() {
+    let workplace = Workplace::new();
+    let policy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/town/driver.safetensors");
+    let begin = format!("task.begin_from={}", policy.display());
+    let settings = [
+        "trainer.module=caraware.driving.dagger",
+        &begin,
+        "traffic.heroes=24",
+        "traffic.others=8",
+        "episode.ticks=600",
+        "episode.training_episodes=1",
+        "episode.evaluation_interval=0",
+        "episode.final_evaluations=1",
+        "episode.evaluation_ticks=20",
+    ];
+    let mut arguments = vec!["train", "driving", "--quiet", "--envs", "2", "--name", "taught"];
+    arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
+    arguments.extend(QUIET);
+    workplace.succeed(&arguments);
+    let report = workplace.report("taught");
+    let [rows, lessons] = ["env_steps", "lessons"].map(|name| report["trainer"][name].as_u64().unwrap());
+    assert!(rows > 20_000 && rows <= 2 * 24 * 600, "{rows} rows");
+    assert!(lessons > 10, "{lessons} lessons");
+    assert!(workplace.path().join("runs/taught/taught.safetensors").is_file());
+    workplace.assert_nothing_left();
+}
