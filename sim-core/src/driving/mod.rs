@@ -39,7 +39,7 @@ const ARRIVED_WITHIN_M: f64 = 5.0;
 const SEARCH_M: [f64; 2] = [5.0, 20.0];
 /// Room beside a hero and another road user that still counts as in the hero's way, metres.
 const SIDE_ROOM_M: f64 = 0.2;
-/// Room beside a person.
+/// Room beside a hero and a person ahead of it.
 const PERSON_ROOM_M: f64 = 0.8;
 
 /// Ground that has roads (x, y, world frame, metres).
@@ -468,11 +468,17 @@ fn leader(
         if libm::hypot(body.origin_m[0] - hero.x_m, body.origin_m[1] - hero.y_m) > reach_m {
             continue;
         }
-        let room_m = if body.is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
-        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + room_m;
+        let corridor_m = 0.5 * f64::from(hero.width_m + body.width_m) + SIDE_ROOM_M;
+        // A person may step into the way ahead. One beside the hero waits until it has passed.
+        let ahead_m = match body.is_person {
+            true => corridor_m - SIDE_ROOM_M + PERSON_ROOM_M,
+            false => corridor_m,
+        };
         let in_the_way = body.spine_m.into_iter().filter_map(|point| {
-            let place = way.project_within(point, corridor_m)?;
-            (place.station_m > station_m + 0.5 * front_m(hero)).then_some(place)
+            let place = way.project_within(point, ahead_m)?;
+            let is_ahead = place.station_m > front_station_m;
+            let is_beside = place.station_m > station_m + 0.5 * front_m(hero) && place.left_m.abs() < corridor_m;
+            (is_ahead || is_beside).then_some(place)
         });
         for place in in_the_way {
             let gap_m = (place.station_m - front_station_m).max(0.0);

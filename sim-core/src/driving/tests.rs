@@ -122,6 +122,29 @@ fn a_hero_sees_the_advice_on_its_last_step_and_not_that_on_others() {
     assert_eq!(tick(&mut driving, &mut states).0.advised_accel_mps2, -4.5);
 }
 
+/// A person walks into the way of the hero, or stands beside it. The hero is 1.8 m wide, and its front is at 14 m.
+#[test]
+fn a_person_ahead_is_in_the_way_with_room_and_one_beside_the_hero_is_not() {
+    let gap_m = |x_m: f64, y_m: f64| {
+        let person = VehicleState {
+            length_m: 0.2,
+            width_m: 0.5,
+            rear_overhang_m: 0.1,
+            ..car(7, Kind::Person, x_m, y_m)
+        };
+        tick(&mut driving(), &mut [car(3, Kind::Hero, 10.0, 0.0), person])
+            .0
+            .leader_gap_m
+    };
+    for side in [-1.0, 1.0] {
+        // 0.8 m of room ahead: up to 1.95 m beside the middle of the way.
+        assert!(gap_m(20.0, side * 1.9) < 7.0 && gap_m(20.0, side * 2.0) == 100.0);
+        // 0.2 m beside its front half: up to 1.35 m.
+        assert!(gap_m(13.0, side * 1.3) == 0.0 && gap_m(13.0, side * 1.4) == 100.0);
+        assert_eq!(gap_m(11.0, side * 1.0), 100.0, "beside its rear half");
+    }
+}
+
 /// A leader's trailer is nearer than the leader, and a hero's own bodies are not in its way.
 #[test]
 fn a_hero_sees_the_trailer_ahead_and_not_its_own() {

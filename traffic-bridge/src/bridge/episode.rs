@@ -17,7 +17,7 @@ use ipc_schema::{
 
 use super::{Bridge, EpisodeCounts, commands::CommandContext};
 use crate::{
-    heroes::{self, passing::HeroPassing},
+    heroes::{self, around::AroundHeroes},
     population::{HeroRoutes, Population, PopulationSize, trips::TripSelection},
     sumo::{
         Sumo,
@@ -37,7 +37,7 @@ pub(super) struct RunningEpisode {
     pub(super) frame: TrafficFrame,
     /// Where SUMO steps more slowly than the mirror needs.
     interpolation: Option<StepInterpolation>,
-    passing: HeroPassing,
+    around: AroundHeroes,
     episode: Episode,
 }
 
@@ -231,7 +231,7 @@ impl Bridge {
             population,
             frame: TrafficFrame::default(),
             interpolation,
-            passing: HeroPassing::default(),
+            around: AroundHeroes::default(),
             episode: *episode,
         })
     }
@@ -247,7 +247,7 @@ impl Bridge {
             population,
             frame,
             interpolation,
-            passing,
+            around,
             episode,
         } = running;
         loop {
@@ -288,7 +288,7 @@ impl Bridge {
                 return Ok(EpisodeEnd::Stopped);
             }
             if self.poses.is_some() {
-                self.follow_heroes(sumo, frame, passing, header)?;
+                self.follow_heroes(sumo, frame, around, header)?;
             }
             let header = match interpolation {
                 Some(interpolation) => self.publish_between(interpolation, frame, header)?,
@@ -443,12 +443,12 @@ impl Bridge {
         Ok(Some(Vec::new()))
     }
 
-    /// Takes control of the heroes that departed in the step, sends their routes, and lets others pass those that stand.
+    /// Takes control of the heroes that departed in the step, sends their routes, and lets others be careful of those that stand.
     fn follow_heroes(
         &mut self,
         sumo: &mut Sumo,
         frame: &TrafficFrame,
-        passing: &mut HeroPassing,
+        around: &mut AroundHeroes,
         header: MessageHeader,
     ) -> Result<(), Failure> {
         let config = &self.membership.run.config;
@@ -456,7 +456,7 @@ impl Bridge {
         let points = heroes::take_over(sumo, frame, driver, config.advises_heroes())?;
         self.outbox.publish_routes(&points, header)?;
         if driver == HeroDriver::Actions {
-            passing.update(sumo, frame)?;
+            around.update(sumo, frame)?;
         }
         Ok(())
     }

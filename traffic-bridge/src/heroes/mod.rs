@@ -5,8 +5,11 @@
 //! later: at a lateral or longitudinal acceleration of 5 m/s² the difference is 25 mm in a step of 0.1 s. Until the end of the step
 //! followers react to the hero's true speed and acceleration.
 
+pub mod around;
 pub mod passing;
 pub mod route;
+pub mod standing;
+pub mod waiting;
 
 use ipc_schema::{
     block::{self, BlockError},

@@ -6,16 +6,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ipc_schema::traffic::{Kind, MetaEvent, TrafficState};
+use ipc_schema::traffic::{Kind, TrafficState};
 
+use super::standing::{STANDS_MPS, Size, StandingHeroes, state_of};
 use crate::sumo::{Sumo, called, convention::world_from_net, error::SumoError, frame::TrafficFrame};
 
 /// For how long a hero has stood in a junction when others pass it, seconds.
 const PATIENCE_S: f64 = 5.0;
 /// Time between two looks at the vehicles that may pass a hero, seconds.
 const LOOKS_EVERY_S: f64 = 1.0;
-/// A road user that is slower stands, m/s.
-const STANDS_MPS: f32 = 0.1;
 /// A vehicle that is farther from a hero does not wait for it, metres.
 const NEAR_M: f64 = 30.0;
 /// Room between a vehicle that passes and the hero, metres.
@@ -23,65 +22,44 @@ const ROOM_M: f64 = 0.3;
 /// Largest distance between two places of an outline that are looked at, metres.
 const SPACING_M: f64 = 0.8;
 
-/// Length and width, metres.
-type Size = [f64; 2];
-
-/// The heroes that stand, and the vehicles that pass them, in one episode.
+/// The vehicles that pass heroes that stand, in one episode.
 #[derive(Debug, Default)]
 pub struct HeroPassing {
-    /// Of all vehicles that are there, by their dense indices.
-    sizes: BTreeMap<u32, Size>,
-    /// Steps for which each hero has stood.
-    standing: BTreeMap<u32, u64>,
     /// The heroes that a vehicle passes, by the vehicle's dense index.
     passed: BTreeMap<u32, BTreeSet<u32>>,
 }
 
 impl HeroPassing {
-    /// Looks at the heroes of a step. From the next one on, SUMO's vehicles that may pass them do not wait.
+    /// From the next step on, SUMO's vehicles that may pass the heroes that stand do not wait.
     ///
     /// # Errors
     /// SUMO refuses.
-    pub fn update(&mut self, sumo: &mut Sumo, frame: &TrafficFrame) -> Result<(), SumoError> {
-        for event in &frame.events {
-            if event.event == MetaEvent::Arrived as u32 {
-                self.sizes.remove(&event.vehicle);
-            } else if event.event == MetaEvent::Departed as u32 && event.kind != Kind::Person as u32 {
-                let size = [event.length_m, event.width_m].map(f64::from);
-                self.sizes.insert(event.vehicle, size);
-            }
-        }
-        let heroes = frame.states.iter().filter(|state| state.kind == Kind::Hero as u32);
-        let steps_before = std::mem::take(&mut self.standing);
-        let stands = heroes.filter(|hero| hero.speed_mps < STANDS_MPS);
-        self.standing = stands
-            .map(|hero| {
-                (
-                    hero.vehicle,
-                    steps_before.get(&hero.vehicle).map_or(1, |steps| steps + 1),
-                )
-            })
-            .collect();
-        self.forget_moved(sumo, frame)?;
+    pub fn update(
+        &mut self,
+        sumo: &mut Sumo,
+        frame: &TrafficFrame,
+        standing: &StandingHeroes,
+    ) -> Result<(), SumoError> {
+        self.forget_moved(sumo, frame, standing)?;
         let steps = |seconds: f64| (seconds / sumo.step_s()).ceil().max(1.0) as u64;
         let (patience, interval) = (steps(PATIENCE_S), steps(LOOKS_EVERY_S));
-        let is_looked_at = |steps: &u64| *steps >= patience && (*steps - patience).is_multiple_of(interval);
-        let waited_for: Vec<u32> = self
-            .standing
-            .iter()
-            .filter_map(|(hero, steps)| is_looked_at(steps).then_some(*hero))
-            .collect();
-        for hero in waited_for {
-            self.let_pass(sumo, frame, hero)?;
+        let is_looked_at = |steps: u64| steps >= patience && (steps - patience).is_multiple_of(interval);
+        for (hero, _) in standing.steps().filter(|(_, steps)| is_looked_at(*steps)) {
+            self.let_pass(sumo, frame, standing, hero)?;
         }
         Ok(())
     }
 
     /// What moves again is waited for again, and vehicles that have left are forgotten.
-    fn forget_moved(&mut self, sumo: &mut Sumo, frame: &TrafficFrame) -> Result<(), SumoError> {
+    fn forget_moved(
+        &mut self,
+        sumo: &mut Sumo,
+        frame: &TrafficFrame,
+        standing: &StandingHeroes,
+    ) -> Result<(), SumoError> {
         for (vehicle, heroes) in &mut self.passed {
             let before = heroes.len();
-            heroes.retain(|hero| self.standing.contains_key(hero));
+            heroes.retain(|hero| standing.has(*hero));
             if heroes.len() < before && state_of(frame, *vehicle).is_some() {
                 ignore(sumo, *vehicle, heroes)?;
             }
@@ -91,11 +69,17 @@ impl HeroPassing {
     }
 
     /// Lets the vehicles pass that stand because of this hero and have room to.
-    fn let_pass(&mut self, sumo: &mut Sumo, frame: &TrafficFrame, hero: u32) -> Result<(), SumoError> {
-        let (Some(state), Some(size)) = (state_of(frame, hero), self.sizes.get(&hero)) else {
+    fn let_pass(
+        &mut self,
+        sumo: &mut Sumo,
+        frame: &TrafficFrame,
+        standing: &StandingHeroes,
+        hero: u32,
+    ) -> Result<(), SumoError> {
+        let (Some(state), Some(size)) = (state_of(frame, hero), standing.size(hero)) else {
             return Ok(());
         };
-        let outline = outline_m(state, *size);
+        let outline = outline_m(state, size);
         let waits = |other: &&TrafficState| {
             let is_vehicle = [Kind::Cav as u32, Kind::Other as u32].contains(&other.kind);
             let distance_m = (other.front_x_m - state.front_x_m).hypot(other.front_y_m - state.front_y_m);
@@ -114,7 +98,7 @@ impl HeroPassing {
                 .chunks_exact(2)
                 .map(|point| world_from_net([point[0], point[1]], sumo.world_origin_m()))
                 .collect();
-            let width_m = self.sizes.get(&other.vehicle).map_or(2.5, |size| size[1]);
+            let width_m = standing.size(other.vehicle).map_or(2.5, |size| size[1]);
             let ahead = ahead_of(&way, [other.front_x_m, other.front_y_m]);
             if ahead.len() > 1 && is_free(&ahead, &outline, width_m / 2.0 + ROOM_M) {
                 passed.insert(hero);
@@ -130,12 +114,6 @@ fn ignore(sumo: &mut Sumo, vehicle: u32, heroes: &BTreeSet<u32>) -> Result<(), S
     let heroes: Vec<u32> = heroes.iter().copied().collect();
     let done = sumo.simulation_mut().ignore_in_junctions(vehicle, &heroes);
     called("let a vehicle pass a hero", done)
-}
-
-/// States are in the order of their dense indices.
-fn state_of(frame: &TrafficFrame, vehicle: u32) -> Option<&TrafficState> {
-    let place = frame.states.binary_search_by_key(&vehicle, |state| state.vehicle);
-    place.ok().map(|place| &frame.states[place])
 }
 
 /// Places around a vehicle, close to each other.

@@ -79,6 +79,8 @@ public:
     double own_speed(std::uint32_t index) const override;
     rust::Vec<double> way_past(std::uint32_t index, std::uint32_t hero) const override;
     void ignore_in_junctions(std::uint32_t index, rust::Slice<const std::uint32_t> heroes) override;
+    double person_limit(std::uint32_t index) const override;
+    void limit_person(std::uint32_t index, double speed) override;
     void remove_by_index(std::uint32_t index) override;
     std::int32_t lane_index(std::uint32_t index) const override;
     rust::Vec<RawLane> route_lanes(std::uint32_t index) const override;

@@ -158,6 +158,10 @@ void EngineSimulation::ignore_in_junctions(std::uint32_t index, rust::Slice<cons
     engine::Vehicle::setParameter(known_id(index), "junctionModel.ignoreIDs", ids);
 }
 
+double EngineSimulation::person_limit(std::uint32_t index) const { return engine::Person::getMaxSpeed(known_id(index)); }
+
+void EngineSimulation::limit_person(std::uint32_t index, double speed) { engine::Person::setMaxSpeed(known_id(index), speed); }
+
 void EngineSimulation::remove_by_index(std::uint32_t index) {
     if (const std::string* id = id_of(index); id != nullptr) {
         engine::Vehicle::remove(*id);

@@ -238,6 +238,10 @@ pub mod ffi {
         fn way_past(self: &Simulation, index: u32, hero: u32) -> Result<Vec<f64>>;
         /// From now on the vehicle does not wait in junctions for these, and for no others than these.
         fn ignore_in_junctions(self: Pin<&mut Simulation>, index: u32, heroes: &[u32]) -> Result<()>;
+        /// The limit of a person's speed, m/s.
+        fn person_limit(self: &Simulation, index: u32) -> Result<f64>;
+        /// Sets it.
+        fn limit_person(self: Pin<&mut Simulation>, index: u32, speed: f64) -> Result<()>;
         /// Removes the vehicle with this dense index; does nothing if there is no such vehicle.
         fn remove_by_index(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
         /// Number of the lane on which the vehicle is, from the right.

@@ -66,6 +66,8 @@ public:
     virtual double own_speed(std::uint32_t index) const = 0;
     virtual rust::Vec<double> way_past(std::uint32_t index, std::uint32_t hero) const = 0;
     virtual void ignore_in_junctions(std::uint32_t index, rust::Slice<const std::uint32_t> heroes) = 0;
+    virtual double person_limit(std::uint32_t index) const = 0;
+    virtual void limit_person(std::uint32_t index, double speed) = 0;
     virtual void remove_by_index(std::uint32_t index) = 0;
     virtual std::int32_t lane_index(std::uint32_t index) const = 0;
     virtual rust::Vec<RawLane> route_lanes(std::uint32_t index) const = 0;

@@ -13,3 +13,4 @@ mod scenario;
 mod signals;
 mod stages;
 mod support;
+mod waiting;

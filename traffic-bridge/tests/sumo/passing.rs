@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use crate::support::{Bench, straight_on};
 use ipc_schema::{config::HeroDriver, traffic::TrafficState};
 use traffic_bridge::{
-    heroes::{apply, passing::HeroPassing, take_over},
+    heroes::{apply, around::AroundHeroes, take_over},
     sumo::frame::TrafficFrame,
 };
 
@@ -22,7 +22,7 @@ fn leaves_at_s(stands_y_m: f64, is_passed: bool) -> Option<f64> {
     let bench = Bench::new();
     let mut sumo = bench.town_with(&VEHICLES, std::iter::once("hero"));
     let (mut frame, mut ids) = (TrafficFrame::default(), BTreeMap::new());
-    let mut passing = HeroPassing::default();
+    let mut around = AroundHeroes::default();
     let mut left_s = None;
     while left_s.is_none() && frame.time_s < 180.0 {
         let pose = state_of(&frame, &ids, "hero").map(|hero| {
@@ -34,7 +34,7 @@ fn leaves_at_s(stands_y_m: f64, is_passed: bool) -> Option<f64> {
         ids.extend(frame.events.iter().map(|event| (event.vehicle, event.id_text())));
         take_over(&mut sumo, &frame, HeroDriver::Actions, false).unwrap();
         if is_passed {
-            passing.update(&mut sumo, &frame).unwrap();
+            around.update(&mut sumo, &frame).unwrap();
         }
         let other = state_of(&frame, &ids, "other").unwrap();
         left_s = (other.front_y_m > BEHIND_Y_M).then_some(frame.time_s);

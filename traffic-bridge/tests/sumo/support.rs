@@ -91,12 +91,16 @@ impl Bench {
 
     /// SUMO with the town and these vehicles, some of them heroes.
     pub fn town_with<'a>(&self, vehicles: &[(&str, f64, &str)], heroes: impl Iterator<Item = &'a str>) -> Sumo {
-        let (net, _) = self.town();
         let vehicle = |(id, at_m, edges): &(&str, f64, &str)| {
             format!("<vehicle id=\"{id}\" depart=\"0\" departPos=\"{at_m}\"><route edges=\"{edges}\"/></vehicle>")
         };
-        let vehicles: String = vehicles.iter().map(vehicle).collect();
-        self.file("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
+        self.town_of(&vehicles.iter().map(vehicle).collect::<String>(), heroes)
+    }
+
+    /// SUMO with the town and the road users of these elements.
+    pub fn town_of<'a>(&self, road_users: &str, heroes: impl Iterator<Item = &'a str>) -> Sumo {
+        let (net, _) = self.town();
+        self.file("a.rou.xml", &format!("<routes>{road_users}</routes>"));
         let scenario = self.file(
             "a.sumocfg",
             "<configuration><input><net-file value=\"town.net.xml\"/><route-files value=\"a.rou.xml\"/></input></configuration>",
