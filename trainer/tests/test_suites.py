@@ -289,9 +289,11 @@ def test_kitti_has_both_cameras_with_their_mounts_and_the_mast(run_dir: Path, sa
 
 
 def _chain(devkit: Any, scene: dict[str, Any], channel: str) -> list[dict[str, Any]]:
-    """The files of a sensor in a scene."""
-    first = devkit.get("sample", scene["first_sample_token"])
-    row = devkit.get("sample_data", first["data"][channel])
+    """The files of a sensor in a scene. A recorder that watches may have missed its first."""
+    sample = devkit.get("sample", scene["first_sample_token"])
+    while channel not in sample["data"]:
+        sample = devkit.get("sample", sample["next"])
+    row = devkit.get("sample_data", sample["data"][channel])
     while row["prev"]:
         row = devkit.get("sample_data", row["prev"])
     rows = [row]

@@ -1,7 +1,7 @@
 //! People wait beside a hero that stands in their way, until it has gone.
 //!
-//! SUMO's people see a vehicle that comes to a crossing, but walk into one that stands with its rear on it, and after ten seconds through
-//! any. A person would not walk into a car that stands. One that is ahead of the hero goes on: the hero waits for it.
+//! SUMO's people let a vehicle pass that comes to a crossing, but once on it, they wait for ten seconds at most and then walk through
+//! whatever stands there. A person would not walk into a car that stands. One ahead of the hero goes on: the hero waits for it.
 
 use std::collections::BTreeMap;
 
@@ -57,9 +57,10 @@ impl WaitingPeople {
                 limit(sumo, person, waiting.limit_mps)?;
             }
         }
+        let is_person = |state: &&TrafficState| state.kind == Kind::Person as u32;
+        let people: Vec<&TrafficState> = frame.states.iter().filter(is_person).collect();
         for hero in heroes_of(frame).filter(|hero| standing.has(hero.vehicle)) {
-            let people = frame.states.iter().filter(|state| state.kind == Kind::Person as u32);
-            for person in people.filter(|person| is_in_the_way(person, hero.vehicle)) {
+            for person in people.iter().filter(|person| is_in_the_way(person, hero.vehicle)) {
                 if self.waiting.contains_key(&person.vehicle) {
                     continue;
                 }
@@ -86,11 +87,14 @@ fn limit(sumo: &mut Sumo, person: u32, limit_mps: f64) -> Result<(), SumoError> 
 
 /// True if a person beside or behind a hero walks into it, straight on.
 fn walks_into(person: &TrafficState, hero: &TrafficState, [length_m, width_m]: Size) -> bool {
-    let (sin, cos) = f64::from(hero.yaw_rad).sin_cos();
     let (dx, dy) = (person.front_x_m - hero.front_x_m, person.front_y_m - hero.front_y_m);
+    let reach_m = LOOKS_M + ROOM_M;
+    if dx.abs().max(dy.abs()) > length_m + width_m + reach_m {
+        return false;
+    }
+    let (sin, cos) = f64::from(hero.yaw_rad).sin_cos();
     // From the middle of the hero's front, forward and to the left.
     let place = [dx * cos + dy * sin, dy * cos - dx * sin];
-    let reach_m = LOOKS_M + ROOM_M;
     if place[0] > 0.0 || place[0] < -length_m - reach_m || place[1].abs() > 0.5 * width_m + reach_m {
         return false;
     }
