@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::support::{Bench, straight_on};
-use ipc_schema::{config::HeroDriver, traffic::TrafficState};
+use crate::support::{Bench, state_of, straight_on};
+use ipc_schema::config::HeroDriver;
 use traffic_bridge::{
     heroes::{apply, around::AroundHeroes, take_over},
     sumo::frame::TrafficFrame,
@@ -41,10 +41,6 @@ fn leaves_at_s(stands_y_m: f64, is_passed: bool) -> Option<f64> {
     }
     sumo.close().unwrap();
     left_s
-}
-
-fn state_of<'a>(frame: &'a TrafficFrame, ids: &BTreeMap<u32, String>, id: &str) -> Option<&'a TrafficState> {
-    frame.states.iter().find(|state| ids[&state.vehicle] == id)
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Shared parts of the tests with real SUMO: nets built by the wheel's own tools, and one simulation at a time.
 
 use std::{
+    collections::BTreeMap,
     path::{Path, PathBuf},
     process::Command,
     sync::{Mutex, MutexGuard, PoisonError},
@@ -45,6 +46,11 @@ pub fn straight_on(state: &TrafficState, speed_mps: f64) -> EgoPose {
         vehicle: state.vehicle,
         flags: 0,
     }
+}
+
+/// The state of the road user with this id; `ids` has those of all that have departed.
+pub fn state_of<'a>(frame: &'a TrafficFrame, ids: &BTreeMap<u32, String>, id: &str) -> Option<&'a TrafficState> {
+    frame.states.iter().find(|state| ids[&state.vehicle] == id)
 }
 
 impl Bench {

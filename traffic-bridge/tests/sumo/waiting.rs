@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::support::{Bench, straight_on};
+use crate::support::{Bench, state_of, straight_on};
 use ipc_schema::{config::HeroDriver, traffic::TrafficState};
 use traffic_bridge::{
     heroes::{apply, around::AroundHeroes, take_over},
@@ -64,10 +64,6 @@ fn outside_m(person: &TrafficState, hero: &TrafficState) -> f64 {
     let (ahead, left) = (dx * cos + dy * sin, dy * cos - dx * sin);
     let beyond = [ahead.max(-HERO_M[0] - ahead), left.abs() - 0.5 * HERO_M[1]];
     f64::hypot(beyond[0].max(0.0), beyond[1].max(0.0))
-}
-
-fn state_of<'a>(frame: &'a TrafficFrame, ids: &BTreeMap<u32, String>, id: &str) -> Option<&'a TrafficState> {
-    frame.states.iter().find(|state| ids[&state.vehicle] == id)
 }
 
 #[test]

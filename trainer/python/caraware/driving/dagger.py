@@ -324,7 +324,7 @@ def teach(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
     pupil, teacher, lessons = Pupil(network, teacher_on(rows.device), generator), teacher_on(torch.device("cpu")), 0
     first = Channel(str(run_file))
     channels = [first, *(first.in_environment(index) for index in range(1, setting(run, "run.envs", int)))]
-    # Only whole numbers far apart give streams that have nothing in common.
+    # Each world's noise has a stream of its own.
     seeds = np.random.SeedSequence(config.seed).generate_state(len(channels))
     worlds = [
         World(each, int(seed), advice if is_advised else None) for each, seed in zip(channels, seeds, strict=True)
